@@ -1,0 +1,53 @@
+"""Feature trunks: an image to a dense feature map of stride 16. C channels, h x w = H // 16 x W // 16 cells."""
+
+import torch
+from torch import Tensor, nn
+
+CELL = 16  # pixels per feature cell of every trunk (VGG16 conv5)
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Trunk(nn.Module):
+    """(B, 3, H, W) RGB in [0, 1] -> (B, C, H // 16, W // 16). Subclasses say their `channels`."""
+
+    channels: int
+
+
+class _ImageNetInput(nn.Module):
+    """Subtracts the ImageNet mean and divides by the standard deviation, per channel."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return (images - self.mean) / self.std
+
+
+class VGG16Trunk(Trunk):
+    """VGG16 without batch normalisation up to conv5_3, before its ReLU (Patch-NetVLAD section 4.1).
+
+    Layer numbers in `features` are torchvision's, so that official checkpoints load by name.
+    """
+
+    channels = 512
+    _BLOCKS = ((64, 64), (128, 128), (256, 256, 256), (512, 512, 512), (512, 512, 512))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.input = _ImageNetInput()
+        layers: list[nn.Module] = []
+        previous = 3
+        for number, block in enumerate(self._BLOCKS):
+            if number:
+                layers.append(nn.MaxPool2d(2, 2))
+            for width in block:
+                layers += [nn.Conv2d(previous, width, 3, padding=1), nn.ReLU(inplace=True)]
+                previous = width
+        self.features = nn.Sequential(*layers[:-1])
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.features(self.input(images))  # type: ignore[no-any-return]

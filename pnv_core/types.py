@@ -1,0 +1,104 @@
+"""The values that travel between the parts. All are frozen; every array is numpy.
+
+D = descriptor dimension, rows x cols = patch grid of one patch size.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One camera image. `stamp_ns` is the image's own stamp (never the wall clock), `rgb` is (H, W, 3) uint8."""
+
+    stamp_ns: int
+    camera: str
+    rgb: NDArray[np.uint8]
+    valid: NDArray[np.bool_] | None = None  # (H, W), False where the robot sees itself; None = all valid
+
+
+@dataclass(frozen=True, eq=False)
+class PatchGrid:
+    """The patch descriptors of one patch size: (rows * cols, D) unit rows, row-major over the grid.
+
+    `size` and `stride` count feature cells. Patch (row, col) is centred at pixel
+    (cell * stride * col + cell * size / 2 - 1, the same for row) of the resized image; cell = 16 pixels.
+    """
+
+    size: int
+    rows: int
+    cols: int
+    descriptors: NDArray[np.float32]
+    stride: int = 1
+
+    def keypoints(self, cell: int = 16) -> NDArray[np.int64]:
+        """(rows * cols, 2) pixel centres (x, y) in the resized image, truncated to whole pixels."""
+        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
+        offset = cell * self.size // 2 - 1
+        return np.stack([cell * self.stride * col + offset, cell * self.stride * row + offset], axis=1)
+
+    def indices(self) -> NDArray[np.int64]:
+        """(rows * cols, 2) grid coordinates (col, row)."""
+        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
+        return np.stack([col, row], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceDescriptor:
+    """What is remembered of an image: a unit global vector (D,) float32 and one PatchGrid per patch size.
+
+    `texture` in [0, 1] is the share of the image that is not blank; it gates meaningless matches.
+    """
+
+    global_vector: NDArray[np.float32]
+    patches: tuple[PatchGrid, ...]
+    texture: float = 1.0
+
+
+@dataclass(frozen=True)
+class ImageRef:
+    """Which image: keyframe id (monotone, never reused; -1 for a query that is no keyframe), stamp, camera, session."""
+
+    id: int
+    stamp_ns: int
+    camera: str
+    session: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    """An image in the database."""
+
+    ref: ImageRef
+    descriptor: PlaceDescriptor
+
+
+@dataclass(frozen=True, eq=False)
+class PatchMatches:
+    """Mutual nearest neighbours of one patch size: (M,) patch numbers in query and reference, and RANSAC's verdict."""
+
+    size: int
+    query: NDArray[np.int64]
+    reference: NDArray[np.int64]
+    inlier: NDArray[np.bool_]  # (M,), all False where RANSAC was not run
+
+
+@dataclass(frozen=True)
+class LoopClosure:
+    """A candidate examined for a query: accepted, or refused with a reason.
+
+    score: P(same place) in [0, 1] after calibration; similarity: cosine of the global vectors;
+    spatial: fused spatial score in [0, 1]; inliers: RANSAC inliers over all patch sizes (matches for the rapid scorer).
+    """
+
+    query: ImageRef
+    match: ImageRef
+    score: float
+    similarity: float
+    spatial: float
+    inliers: int
+    accepted: bool
+    reason: str = ""
+    matches: tuple[PatchMatches, ...] = field(default=(), compare=False, repr=False)
