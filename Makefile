@@ -1,0 +1,46 @@
+# make install   the environment .venv, with ROS 2 (rclpy), torch and the tools
+# make demo      a sequence through the real node; IMAGES=DIR, VIDEO=FILE or BAG=DIR take your own
+# make slam-demo a pose graph closed by the node
+# make test      every test
+# make bench     the benchmarks
+# make lint      ruff and mypy
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+# torch of PyPI carries CUDA (about 3 GB); the same release without it is taken where its index can be reached.
+TORCH_CPU := https://download.pytorch.org/whl/cpu
+REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
+
+.PHONY: install demo slam-demo test bench lint clean
+
+install: $(READY)
+
+$(READY): setup.py setup.cfg pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
+	    { echo "python3 -m venv failed; on Debian: apt-get install python3-venv" >&2; exit 2; }
+	$(BIN)/python -c "import torch" 2>/dev/null || \
+	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q torch --extra-index-url $(TORCH_CPU); fi
+	$(BIN)/pip install --progress-bar off -q -e ".[ros,dev]"
+	touch $@
+
+demo: $(READY)
+	$(BIN)/python -m examples.demo $(if $(IMAGES),--images "$(IMAGES)") $(if $(VIDEO),--video "$(VIDEO)") \
+	    $(if $(BAG),--bag "$(BAG)")
+
+slam-demo: $(READY)
+	$(BIN)/python -m examples.pose_graph
+
+test: $(READY)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)
+
+bench: $(READY)
+	$(BIN)/python -m benchmarks.run
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf build install log out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

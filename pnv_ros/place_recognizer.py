@@ -1,0 +1,5 @@
+"""The executable `place_recognizer`."""
+
+
+def main() -> int:
+    return 0

@@ -1,0 +1,67 @@
+"""Packaging of pnv_ros: one package for colcon (ament_python) and pip."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = "pnv_ros"
+
+REQUIRED = [
+    "numpy>=1.26",
+    "opencv-python-headless>=4.8",
+    "torch>=2.4",  # torch.load(weights_only=True) with an allow list, used for published checkpoints
+    "faiss-cpu>=1.8",
+    "safetensors>=0.4",
+    "scipy>=1.11",
+    "tqdm>=4.60",
+    "rosbags>=0.10",  # rosbag2 in sqlite3 and mcap without a ROS installation
+]
+
+ROS = [
+    # The Jazzy wheels of PyPI, for machines without a ROS installation. Each pin is the set that was built together:
+    # a newer rclpy wheel is of the rolling distribution, whose message hashes Jazzy does not accept.
+    "ros-jazzy-rclpy[fastrtps]==7.1.6",
+    "ros-jazzy-common-interfaces==5.3.6",  # message packages generated for the rclpy above
+]
+
+DEVELOPMENT = [
+    "pytest>=8",
+    "hypothesis>=6.100",
+    "ruff>=0.6",
+    "mypy>=1.11",
+    "matplotlib>=3.8",
+    "pyyaml>=6",
+    "colcon-common-extensions>=0.3",
+    "empy<5",  # colcon reads package templates with empy 3 or 4
+    "catkin_pkg>=1",  # colcon reads package.xml with it
+    "setuptools<80",  # 80 removed the develop options that `colcon build --symlink-install` passes
+]
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    description="Visual loop closure for ROS 2 with Patch-NetVLAD",
+    long_description="Camera images in, loop closures with a score that means something out.",
+    author="pnv_ros contributors",
+    maintainer="pnv_ros contributors",
+    maintainer_email="pnv_ros@users.noreply.github.com",
+    license="MIT",
+    python_requires=">=3.10",
+    packages=find_packages(include=["pnv_core*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
+    package_data={"pnv_core": ["models/*"], "pnv_cli": ["*.html"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/launch", glob("launch/*.launch.py")),
+        (f"share/{PACKAGE}/config", glob("config/*")),
+    ],
+    install_requires=REQUIRED,
+    extras_require={"ros": ROS, "dev": DEVELOPMENT},
+    entry_points={
+        "console_scripts": [
+            "place_recognizer = pnv_ros.place_recognizer:main",
+            "pnv = pnv_cli.main:main",
+        ]
+    },
+    zip_safe=False,
+)
