@@ -112,7 +112,7 @@ def checked_image(rgb: Any) -> NDArray[np.uint8]:
 def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """Bilinear with anti-aliasing and 8-bit rounding, as the reference resizes (Pillow)."""
     if rgb.shape[:2] == (height, width):
-        return np.ascontiguousarray(rgb)
+        return rgb.copy()  # callers may hand in read-only message buffers, which torch refuses
     return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR)).copy()
 
 
