@@ -1,0 +1,313 @@
+"""KeyframeDatabase. N = keyframes, D = dimension of the global vector."""
+
+import threading
+from bisect import bisect_left
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.config import Config
+from pnv_core.database.eviction import make_eviction
+from pnv_core.database.index import ExactIndex, VectorIndex
+from pnv_core.database.patch_codes import (
+    DTYPES,
+    GridLayout,
+    PatchCodes,
+    buffer_bytes,
+    encode,
+    layout_of,
+    views,
+)
+from pnv_core.database.vectors import Row, VectorTable
+from pnv_core.errors import ConfigError, PnvError
+from pnv_core.types import ImageRef, PlaceDescriptor
+
+MB = 1_000_000
+# Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
+OBJECT_BYTES = 1500
+
+
+@dataclass(frozen=True, eq=False)
+class StoredKeyframe:
+    """A keyframe as the database holds it. Never changed, so that a snapshot may be read by another thread."""
+
+    __slots__ = ("buffer", "layouts", "ref", "row", "texture", "vector")
+
+    ref: ImageRef
+    vector: NDArray[np.float32]  # (D,), a row of the vector table, valid while `row` lives
+    row: Row
+    layouts: tuple[GridLayout, ...]
+    buffer: NDArray[np.uint8]
+    texture: float
+
+    def patches(self) -> tuple[PatchCodes, ...]:
+        return views(self.buffer, self.layouts)
+
+    def descriptor(self) -> PlaceDescriptor:
+        return PlaceDescriptor(self.vector.copy(), tuple(codes.grid() for codes in self.patches()), self.texture)
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The database at one moment, for saving in another thread while frames go on."""
+
+    dim: int
+    precision: str
+    next_id: int
+    session: int
+    keyframes: list[StoredKeyframe]  # by ascending id
+
+
+@dataclass(frozen=True)
+class DatabaseStats:
+    """What the database holds and what it gave up."""
+
+    keyframes: int
+    bytes_used: int
+    bytes_budget: int
+    evicted: int
+    sessions: int
+
+    @property
+    def bytes_free(self) -> int:
+        return self.bytes_budget - self.bytes_used
+
+
+class KeyframeDatabase:
+    """Keyframes by id, searched by global vector, within a hard budget of memory.
+
+    Adding and querying belong to one thread; `snapshot` and `stats` may be called from any other. Ids count upwards
+    over all sessions and are never reused. No clock: age is the image stamp.
+    """
+
+    def __init__(
+        self,
+        dim: int,
+        memory_budget_mb: float = 1024.0,
+        eviction: str = "oldest",
+        index: str = "auto",
+        patch_store: str = "memory",
+        patch_precision: str = "float16",
+        read_only: bool = False,
+    ) -> None:
+        if patch_precision not in DTYPES:
+            allowed = ", ".join(DTYPES)
+            raise ConfigError(f"patch_precision = {patch_precision!r} is out of range; allowed: one of {allowed}")
+        self.dim = dim
+        self.bytes_budget = int(memory_budget_mb * MB)
+        self.patch_precision = patch_precision
+        self.read_only = read_only
+        self._eviction_name = eviction
+        self._lock = threading.Lock()
+        self._session = 0
+        self._next_id = 0
+        self._evicted = 0
+        self._layouts: dict[tuple[GridLayout, ...], tuple[GridLayout, ...]] = {}
+        self._start_empty()
+
+    def _start_empty(self) -> None:
+        self._eviction = make_eviction(self._eviction_name)
+        least = self.dim * 4 + OBJECT_BYTES
+        self._table = VectorTable(max(1, self.bytes_budget // least), self.dim)
+        self._index: VectorIndex = ExactIndex(self._table)
+        self._keyframes: dict[int, StoredKeyframe] = {}
+        self._ids: list[int] = []  # ascending
+        self._cameras: dict[str, int] = {}
+        self._patch_bytes = 0
+
+    @classmethod
+    def from_config(cls, config: Config, dim: int, *, read_only: bool = False) -> "KeyframeDatabase":
+        return cls(
+            dim,
+            memory_budget_mb=config.memory_budget_mb,
+            eviction=config.eviction,
+            index=config.index,
+            patch_store=config.patch_store,
+            patch_precision=config.patch_precision,
+            read_only=read_only,
+        )
+
+    def __len__(self) -> int:
+        return len(self._ids)
+
+    def __contains__(self, keyframe: int) -> bool:
+        return keyframe in self._keyframes
+
+    @property
+    def session(self) -> int:
+        """Number of the session that new keyframes belong to."""
+        return self._session
+
+    @property
+    def bytes_used(self) -> int:
+        """Bytes of vectors, patches and index, and an allowance for the objects that hold them."""
+        return self._patch_bytes + len(self._ids) * self._fixed_bytes
+
+    @property
+    def evicted(self) -> int:
+        """Keyframes given up so far to stay within the budget."""
+        return self._evicted
+
+    @property
+    def _fixed_bytes(self) -> int:
+        return self._table.row_bytes + self._index.row_bytes + OBJECT_BYTES
+
+    def bytes_per_keyframe(self, descriptor: PlaceDescriptor) -> int:
+        """Bytes this keyframe would take, known before it is added."""
+        return self._fixed_bytes + buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
+
+    def stats(self) -> DatabaseStats:
+        with self._lock:
+            return DatabaseStats(
+                keyframes=len(self._ids),
+                bytes_used=self.bytes_used,
+                bytes_budget=self.bytes_budget,
+                evicted=self._evicted,
+                sessions=len({self._keyframes[i].ref.session for i in self._ids}),
+            )
+
+    def add(self, stamp_ns: int, camera: str, descriptor: PlaceDescriptor) -> ImageRef:
+        """Remember an image under the next id, giving up others first where the budget asks for it.
+
+        Raises PnvError when read-only, for a vector that is not unit (D,), or for a keyframe larger than the budget.
+        """
+        if self.read_only:
+            raise PnvError("the database is read-only (localisation mode); allowed: queries")
+        vector = _unit_vector(descriptor.global_vector, self.dim)
+        layouts = self._shared(layout_of(descriptor.patches, self.patch_precision))
+        need = self._fixed_bytes + buffer_bytes(layouts)
+        if need > self.bytes_budget:
+            raise PnvError(
+                f"one keyframe takes {need / MB:.3g} MB; memory_budget_mb allows {self.bytes_budget / MB:.3g}"
+            )
+        buffer = encode(descriptor.patches, layouts)
+        with self._lock:
+            while self._ids and (self.bytes_used + need > self.bytes_budget or self._table.full):
+                self._remove(self._eviction.choose())
+                self._evicted += 1
+            ref = ImageRef(self._next_id, stamp_ns, camera, self._session)
+            self._next_id += 1
+            self._insert(ref, vector, layouts, buffer, descriptor.texture)
+        return ref
+
+    def _insert(
+        self,
+        ref: ImageRef,
+        vector: NDArray[np.float32],
+        layouts: tuple[GridLayout, ...],
+        buffer: NDArray[np.uint8],
+        texture: float,
+    ) -> None:
+        camera = self._cameras.setdefault(ref.camera, len(self._cameras))
+        row = self._table.add(vector, ref.id, ref.stamp_ns, ref.session, camera)
+        kept = self._table.vectors[row.slot]
+        self._keyframes[ref.id] = StoredKeyframe(ref, kept, row, layouts, buffer, texture)
+        self._ids.append(ref.id)
+        self._patch_bytes += len(buffer)
+        self._index.add(row.slot)
+        self._eviction.added(ref, kept)
+
+    def _remove(self, keyframe: int) -> None:
+        stored = self._keyframes.pop(keyframe)
+        del self._ids[bisect_left(self._ids, keyframe)]
+        self._patch_bytes -= len(stored.buffer)
+        self._index.remove(stored.row.slot)
+        self._eviction.removed(stored.ref)
+        self._table.remove(stored.row)
+
+    def _shared(self, layouts: tuple[GridLayout, ...]) -> tuple[GridLayout, ...]:
+        return self._layouts.setdefault(layouts, layouts)
+
+    def nearest(
+        self,
+        vector: NDArray[np.float32],
+        k: int,
+        stamp_ns: int,
+        exclude_recent_ns: int,
+        camera: str | None = None,
+    ) -> list[tuple[ImageRef, float]]:
+        """The k keyframes most similar to a unit vector (D,), with their cosine, best first; equal ones by id.
+
+        Keyframes of the current session younger than `stamp_ns - exclude_recent_ns` are left out; those of other
+        sessions never are. `camera` restricts the search to one camera.
+        """
+        query = _unit_vector(vector, self.dim)
+        number = None if camera is None else self._cameras.get(camera, -1)
+        allowed = self._table.allowed(self._session, stamp_ns - exclude_recent_ns, number)
+        slots = self._index.search(query, k, allowed)
+        # once more, row by row: equal vectors then have equal similarities wherever they lie, and ids break the tie
+        similarity = np.clip((self._table.vectors[slots] * query).sum(axis=1), -1.0, 1.0)
+        ids = self._table.ids[slots]
+        best = np.lexsort((ids, -similarity))[:k]
+        return [(self._keyframes[int(ids[i])].ref, float(similarity[i])) for i in best]
+
+    def ref(self, keyframe: int) -> ImageRef:
+        """Raises KeyError for an id that is not, or no longer, in the database."""
+        return self._keyframes[keyframe].ref
+
+    def descriptor(self, keyframe: int) -> PlaceDescriptor:
+        """What is stored of a keyframe; its patches are float16 when stored as float16, float32 otherwise."""
+        return self._keyframes[keyframe].descriptor()
+
+    def patches(self, keyframe: int) -> tuple[PatchCodes, ...]:
+        """The patches of a keyframe exactly as stored, one PatchCodes per patch size (int8 with its scales)."""
+        return self._keyframes[keyframe].patches()
+
+    def vector(self, keyframe: int) -> NDArray[np.float32]:
+        """The global vector (D,) of a keyframe."""
+        return self._keyframes[keyframe].vector.copy()
+
+    def neighbours(self, keyframe: int, reach: int) -> list[ImageRef]:
+        """Up to `reach` keyframes before and after this one, of its session and camera, in order of id, without it."""
+        centre = self._keyframes[keyframe].ref
+        at = bisect_left(self._ids, keyframe)
+        before = self._walk(range(at - 1, -1, -1), centre, reach)
+        after = self._walk(range(at + 1, len(self._ids)), centre, reach)
+        return before[::-1] + after
+
+    def _walk(self, places: range, centre: ImageRef, reach: int) -> list[ImageRef]:
+        found: list[ImageRef] = []
+        for place in places:
+            ref = self._keyframes[self._ids[place]].ref
+            if len(found) == reach or ref.session != centre.session:
+                break
+            if ref.camera == centre.camera:
+                found.append(ref)
+        return found
+
+    def last(self) -> ImageRef | None:
+        """The keyframe added last, if any."""
+        return self._keyframes[self._ids[-1]].ref if self._ids else None
+
+    def refs(self) -> list[ImageRef]:
+        """Every keyframe, by ascending id."""
+        with self._lock:
+            return [self._keyframes[i].ref for i in self._ids]
+
+    def new_session(self) -> int:
+        """Begin another run: later keyframes belong to a session of their own. Gives its number."""
+        with self._lock:
+            self._session += 1
+            return self._session
+
+    def clear(self) -> None:
+        """Forget every keyframe; ids go on counting."""
+        with self._lock:
+            self._start_empty()
+
+    def snapshot(self) -> Snapshot:
+        """The database at this moment; costs a list, not a copy of the keyframes."""
+        with self._lock:
+            keyframes = [self._keyframes[i] for i in self._ids]
+            return Snapshot(self.dim, self.patch_precision, self._next_id, self._session, keyframes)
+
+
+def _unit_vector(vector: NDArray, dim: int) -> NDArray[np.float32]:
+    vector = np.asarray(vector, np.float32)
+    if vector.shape != (dim,):
+        raise PnvError(f"global vector of shape {vector.shape} given; allowed: ({dim},)")
+    norm = float(np.sqrt(vector @ vector))
+    if not abs(norm - 1.0) < 1e-3:
+        raise PnvError(f"global vector of length {norm:g} given; allowed: a unit vector")
+    return vector
