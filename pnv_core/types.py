@@ -4,6 +4,7 @@ D = descriptor dimension, rows x cols = patch grid of one patch size.
 """
 
 from dataclasses import dataclass, field
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,17 @@ class PatchMatches:
     inlier: NDArray[np.bool_]  # (M,), all False where RANSAC was not run
 
 
+class Reason(StrEnum):
+    """Why a candidate was refused. The order is the wire code of ~/candidates: append only."""
+
+    ACCEPTED = ""
+    LOW_SCORE = "low_score"
+    LOW_TEXTURE = "low_texture"
+    UNCONFIRMED = "unconfirmed"
+    ODOMETRY = "odometry"
+    NOT_RERANKED = "not_reranked"
+
+
 @dataclass(frozen=True)
 class LoopClosure:
     """A candidate examined for a query: accepted, or refused with a reason.
@@ -100,5 +112,5 @@ class LoopClosure:
     spatial: float
     inliers: int
     accepted: bool
-    reason: str = ""
+    reason: Reason = Reason.ACCEPTED
     matches: tuple[PatchMatches, ...] = field(default=(), compare=False, repr=False)
