@@ -27,6 +27,7 @@ ROS = [
 DEVELOPMENT = [
     "pytest>=8",
     "hypothesis>=6.100",
+    "rosbags-image>=0.10",  # an independent decoder to test against; it knows neither row padding nor size limits
     "ruff>=0.6",
     "mypy>=1.11",
     "matplotlib>=3.8",
