@@ -1,0 +1,1 @@
+"""Training of place recognition networks."""
