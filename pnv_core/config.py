@@ -49,21 +49,39 @@ class Config:
     weights: str = setting("default", "model: 'default' (in the package), a published name, or a file")
     device: str = setting("cpu", "where the network runs", choices=("cpu", "cuda", "auto"))
     threads: int = setting(2, "threads of the network and of matching; 0 = all cores", low=0, high=256)
-    image_width: int = setting(0, "width the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192)
-    image_height: int = setting(0, "height the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192)
-    patch_sizes: tuple[int, ...] = setting((), "patch sizes; empty = the model's", kind=int, unit="cells of 16 px", low=1, high=64)
-    patch_strides: tuple[int, ...] = setting((), "stride per patch size; empty = 1", kind=int, unit="cells", low=1, high=16)
-    patch_weights: tuple[float, ...] = setting((), "fusion weight per patch size, sum 1; empty = the model's", kind=float, low=0.0, high=1.0)
-    patch_mode: str = setting("exact", "patch aggregation: exact, or fast (approximate, judged by recall)", choices=("exact", "fast"))
+    image_width: int = setting(
+        0, "width the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192
+    )
+    image_height: int = setting(
+        0, "height the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192
+    )
+    patch_sizes: tuple[int, ...] = setting(
+        (), "patch sizes; empty = the model's", kind=int, unit="cells of 16 px", low=1, high=64
+    )
+    patch_strides: tuple[int, ...] = setting(
+        (), "stride per patch size; empty = 1", kind=int, unit="cells", low=1, high=16
+    )
+    patch_weights: tuple[float, ...] = setting(
+        (), "fusion weight per patch size, sum 1; empty = the model's", kind=float, low=0.0, high=1.0
+    )
+    patch_mode: str = setting(
+        "exact", "patch aggregation: exact, or fast (approximate, judged by recall)", choices=("exact", "fast")
+    )
 
     # Keyframes
-    min_interval_s: float = setting(0.5, "least time between keyframes", unit="s", low=0.0, live=True)
-    min_change: float = setting(0.05, "least change between keyframes: 1 - cosine of the global vectors", low=0.0, high=2.0, live=True)
+    min_interval_s: float = setting(0.5, "least time between keyframes", unit="s", low=0.0, high=1e6, live=True)
+    min_change: float = setting(
+        0.05, "least change between keyframes: 1 - cosine of the global vectors", low=0.0, high=2.0, live=True
+    )
 
     # Retrieval
-    exclude_recent_s: float = setting(30.0, "keyframes younger than this are no candidates", unit="s", low=0.0, live=True)
+    exclude_recent_s: float = setting(
+        30.0, "keyframes younger than this are no candidates", unit="s", low=0.0, live=True
+    )
     candidates: int = setting(10, "keyframes re-ranked per query", low=1, high=1000, live=True)
-    time_budget_ms: float = setting(0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, live=True)
+    time_budget_ms: float = setting(
+        0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, live=True
+    )
     index: str = setting("auto", "index of the global vectors", choices=("auto", "exact", "hnsw", "ivfpq"))
 
     # Re-ranking
@@ -76,7 +94,7 @@ class Config:
     consistency: int = setting(3, "neighbouring keyframes that must agree; 0 = none", low=0, high=50, live=True)
 
     # Memory
-    memory_budget_mb: float = setting(1024.0, "bound on descriptors, patches and index together", unit="MB", low=1.0)
+    memory_budget_mb: float = setting(1024.0, "bound on descriptors, patches and index together", unit="MB", low=1.0, high=1e7)
     eviction: str = setting("oldest", "what goes when the budget is full", choices=("oldest", "densest"))
     patch_store: str = setting("memory", "where patches of old keyframes live", choices=("memory", "disk"))
     patch_precision: str = setting("float16", "precision of stored patches", choices=("float32", "float16", "int8"))
@@ -89,7 +107,9 @@ class Config:
             if given and len(given) != n:
                 raise ConfigError(f"{name} = {given} has {len(given)} entries; patch_sizes has {n}")
         if self.patch_weights and abs(sum(self.patch_weights) - 1.0) > 1e-6:
-            raise ConfigError(f"patch_weights = {self.patch_weights} sum to {sum(self.patch_weights):g}; allowed: a sum of 1")
+            raise ConfigError(
+                f"patch_weights = {self.patch_weights} sum to {sum(self.patch_weights):g}; allowed: a sum of 1"
+            )
 
     @classmethod
     def make(cls, preset: str = "default", **overrides: Any) -> "Config":

@@ -1,6 +1,7 @@
 """How a setting is declared: once, with default, meaning, unit and limits."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,8 +38,9 @@ class Setting:
         wrong_type = not isinstance(value, self.kind) or (self.kind is int and isinstance(value, bool))
         too_low = not wrong_type and self.low is not None and not value >= self.low
         too_high = not wrong_type and self.high is not None and not value <= self.high
+        not_finite = not wrong_type and self.kind is float and not math.isfinite(value)
         no_choice = not wrong_type and bool(self.choices) and value not in self.choices
-        if wrong_type or too_low or too_high or no_choice:
+        if wrong_type or not_finite or too_low or too_high or no_choice:
             raise ConfigError(f"{self.name} = {value!r} is out of range; allowed: {self.allowed()}")
         return value
 
