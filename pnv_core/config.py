@@ -76,11 +76,11 @@ class Config:
 
     # Retrieval
     exclude_recent_s: float = setting(
-        30.0, "keyframes younger than this are no candidates", unit="s", low=0.0, live=True
+        30.0, "keyframes younger than this are no candidates", unit="s", low=0.0, high=1e6, live=True
     )
     candidates: int = setting(10, "keyframes re-ranked per query", low=1, high=1000, live=True)
     time_budget_ms: float = setting(
-        0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, live=True
+        0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, high=1e6, live=True
     )
     index: str = setting("auto", "index of the global vectors", choices=("auto", "exact", "hnsw", "ivfpq"))
 
