@@ -4,7 +4,6 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-
 from pnv_core.config import Config
 from pnv_core.errors import ConfigError
 from pnv_core.settings import Setting, settings_of
@@ -63,5 +62,3 @@ def writable(path: str | Path) -> Path:
     if not os.access(target if target.exists() else target.parent, os.W_OK):
         raise ConfigError(f"{path}: not writable by this user")
     return target
-
-

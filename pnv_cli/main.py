@@ -12,7 +12,9 @@ COMMANDS = ("describe", "match", "run", "weights")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand. 0 done, 2 unusable input with one line on stderr, 130 interrupted."""
-    parser = argparse.ArgumentParser(prog="pnv", description="Visual place recognition with Patch-NetVLAD.", allow_abbrev=False)
+    parser = argparse.ArgumentParser(
+        prog="pnv", description="Visual place recognition with Patch-NetVLAD.", allow_abbrev=False
+    )
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for name in COMMANDS:
         import_module(f"pnv_cli.{name}").add_parser(subparsers)

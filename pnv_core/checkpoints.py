@@ -26,11 +26,15 @@ def load_checkpoint(path: Path | str) -> Model:
     except FileNotFoundError:
         raise ModelError(f"{source}: no such checkpoint file") from None
     except pickle.UnpicklingError:
-        raise ModelError(f"{source}: is no plain tensor file (its pickle is damaged or holds other objects); refused") from None
+        raise ModelError(
+            f"{source}: is no plain tensor file (its pickle is damaged or holds other objects); refused"
+        ) from None
     except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ModelError(f"{source}: not a readable torch checkpoint, or truncated ({reason[:160]})") from None
-    return build_model(ModelInfo(trunk="vgg16", provenance=f"checkpoint {Path(source).name}"), _renamed(content, source), source)
+    return build_model(
+        ModelInfo(trunk="vgg16", provenance=f"checkpoint {Path(source).name}"), _renamed(content, source), source
+    )
 
 
 def _renamed(content: Any, source: str) -> dict[str, Tensor]:
@@ -58,13 +62,17 @@ def _renamed(content: Any, source: str) -> dict[str, Tensor]:
             raise ModelError(f"{source}: {key} occurs twice, with and without 'module.'")
         tensors[name] = tensor.flatten(1) if name in ("netvlad.assignment", "global_projection.weight") else tensor
     if unexpected:
-        raise ModelError(f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; allowed: {', '.join(list(expected)[:2])}, ... WPCA.0.bias")
+        raise ModelError(
+            f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; allowed: {', '.join(list(expected)[:2])}, ... WPCA.0.bias"
+        )
     if missing := [key for key, name in expected.items() if name not in tensors]:
         raise ModelError(f"{source}: lacks {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}")
     for key in ("pool.conv.weight", "WPCA.0.weight"):
         raw = next(t for k, t in state.items() if str(k).replace("module.", "") == key)
         if raw.ndim != 4 or raw.shape[2:] != (1, 1):
-            raise ModelError(f"{source}: {key} has shape {tuple(raw.shape)}; allowed: a 1x1 convolution (outputs, inputs, 1, 1)")
+            raise ModelError(
+                f"{source}: {key} has shape {tuple(raw.shape)}; allowed: a 1x1 convolution (outputs, inputs, 1, 1)"
+            )
     pcs = content.get("num_pcs")
     outputs = tensors["global_projection.bias"].numel()
     if pcs is not None and (not isinstance(pcs, int) or pcs != outputs):

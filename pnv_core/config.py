@@ -94,7 +94,9 @@ class Config:
     consistency: int = setting(3, "neighbouring keyframes that must agree; 0 = none", low=0, high=50, live=True)
 
     # Memory
-    memory_budget_mb: float = setting(1024.0, "bound on descriptors, patches and index together", unit="MB", low=1.0, high=1e7)
+    memory_budget_mb: float = setting(
+        1024.0, "bound on descriptors, patches and index together", unit="MB", low=1.0, high=1e7
+    )
     eviction: str = setting("oldest", "what goes when the budget is full", choices=("oldest", "densest"))
     patch_store: str = setting("memory", "where patches of old keyframes live", choices=("memory", "disk"))
     patch_precision: str = setting("float16", "precision of stored patches", choices=("float32", "float16", "int8"))

@@ -34,9 +34,13 @@ def load_describer(weights: str | Path = "default", preset: str = "default", **s
 
 def describer_from(config: Config) -> "Describer":
     """The describer a Config asks for."""
-    path = resolve_weights(config.weights)
-    model = load_checkpoint(path) if path.suffixes[-2:] == [".pth", ".tar"] or path.suffix in (".pth", ".pt") else load_model(path)
-    return Describer(model, config)
+    return Describer(read_model(resolve_weights(config.weights)), config)
+
+
+def read_model(path: Path) -> Model:
+    """A model file, or an official checkpoint (.pth.tar, .pth, .pt)."""
+    official = path.name.endswith((".pth.tar", ".pth", ".pt"))
+    return load_checkpoint(path) if official else load_model(path)
 
 
 class Describer:
@@ -148,7 +152,9 @@ def _completed(config: Config, model: Model) -> Config:
     )
     cells = min(width, height) // CELL
     if max(sizes) > cells:
-        raise ConfigError(f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // CELL}x{height // CELL} cells; allowed: 1 to {cells}")
+        raise ConfigError(
+            f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // CELL}x{height // CELL} cells; allowed: 1 to {cells}"
+        )
     return done
 
 

@@ -20,7 +20,9 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     try:
         with Image.open(path) as image:
             if image.width * image.height > MAX_PIXELS:
-                raise ImageError(f"{path}: {image.width}x{image.height} pixels; allowed: up to {MAX_PIXELS // 10**6} megapixels")
+                raise ImageError(
+                    f"{path}: {image.width}x{image.height} pixels; allowed: up to {MAX_PIXELS // 10**6} megapixels"
+                )
             if image.mode in ("I;16", "I;16B", "I;16L", "I;16N", "I"):
                 return np.repeat((np.asarray(image).clip(0, 65535) >> 8).astype(np.uint8)[:, :, None], 3, axis=2)
             return np.array(ImageOps.exif_transpose(image).convert("RGB"))

@@ -17,7 +17,9 @@ class KeyframeSelector:
     def due(self, frame: Frame) -> bool:
         """Whether `min_interval_s` has passed since the camera's last keyframe. A stamp that goes back is not due."""
         last = self._last.get(frame.camera)
-        return last is None or (frame.stamp_ns > last[0] and frame.stamp_ns - last[0] >= self.config.min_interval_s * 1e9)
+        return last is None or (
+            frame.stamp_ns > last[0] and frame.stamp_ns - last[0] >= self.config.min_interval_s * 1e9
+        )
 
     def differs(self, frame: Frame, descriptor: PlaceDescriptor) -> bool:
         """Whether 1 - cosine to the camera's last keyframe is at least `min_change`."""

@@ -99,8 +99,13 @@ def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Mod
         part, _, rest = name.partition(".")
         groups.setdefault(part, {})[rest] = tensor.float()
     required = {"trunk", "netvlad", "global_projection"}
-    if set(groups) - {"trunk"} not in ({"netvlad", "global_projection"}, {"netvlad", "global_projection", "patch_projection"}):
-        raise ModelError(f"{source}: holds the parts {sorted(groups)}; allowed: {sorted(required)} and patch_projection")
+    if set(groups) - {"trunk"} not in (
+        {"netvlad", "global_projection"},
+        {"netvlad", "global_projection", "patch_projection"},
+    ):
+        raise ModelError(
+            f"{source}: holds the parts {sorted(groups)}; allowed: {sorted(required)} and patch_projection"
+        )
     trunk = make_trunk(info.trunk, info.trunk_options)
     centroids = groups["netvlad"].get("centroids")
     if centroids is None or centroids.ndim != 2 or centroids.shape[1] != trunk.channels:

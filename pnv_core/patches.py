@@ -10,7 +10,6 @@ only the norms of the intra-normalisation need the unprojected sums.
 
 from collections.abc import Sequence
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 
@@ -47,7 +46,9 @@ def _sliding_sums(maps: Tensor, sizes: Sequence[int], dim: int) -> dict[int, Ten
     return sums
 
 
-def patch_vlads(x: Tensor, weights: Tensor, centroids: Tensor, shape: tuple[int, int], size: int, stride: int = 1) -> Tensor:
+def patch_vlads(
+    x: Tensor, weights: Tensor, centroids: Tensor, shape: tuple[int, int], size: int, stride: int = 1
+) -> Tensor:
     """Unprojected patch VLADs (n, K * C): the definition, for small maps and for fitting projections.
 
     x (C, N) unit descriptors, weights (K, N) soft assignment, centroids (K, C).

@@ -41,6 +41,6 @@ class Reranker:
             else:
                 score, inlier = rapid_spatial_score(q, r, matches), np.zeros(len(matches[0]), bool)
             scores.append(score)
-            found.append(PatchMatches(q.size, *matches, inlier))
+            found.append(PatchMatches(q.size, *matches, inlier, q.keypoints()[matches[0]], r.keypoints()[matches[1]]))
         counted = sum(int(m.inlier.sum()) if self.scorer == "ransac" else len(m.query) for m in found)
         return SpatialResult(fused_score(scores, self.weights), tuple(scores), tuple(found), counted)

@@ -13,7 +13,9 @@ RANSAC_TOLERANCE_CELLS = 1.5  # the authors' code: 1.5 strides, 24 px (the paper
 MIN_MATCHES = 4  # a homography needs four points
 
 
-def ransac_score(query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[np.int64], NDArray[np.int64]]) -> tuple[float, NDArray[np.bool_]]:
+def ransac_score(
+    query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[np.int64], NDArray[np.int64]]
+) -> tuple[float, NDArray[np.bool_]]:
     """Share of the query's patches that a homography reference -> query explains, and which matches (M,) do.
 
     Fewer than four matches, or no homography (all on one line), give 0.
@@ -29,7 +31,9 @@ def ransac_score(query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[
     return float(inlier.sum()) / (query.rows * query.cols), inlier
 
 
-def rapid_spatial_score(query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[np.int64], NDArray[np.int64]]) -> float:
+def rapid_spatial_score(
+    query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[np.int64], NDArray[np.int64]]
+) -> float:
     """Coherence of the matched displacements; 1 for identical images, 0 without matches.
 
     Patch-NetVLAD section 3.4, anchored at the grid extent (as the authors' code does) and divided by its maximum.

@@ -84,6 +84,8 @@ class PatchMatches:
     query: NDArray[np.int64]
     reference: NDArray[np.int64]
     inlier: NDArray[np.bool_]  # (M,), all False where RANSAC was not run
+    query_xy: NDArray[np.int64]  # (M, 2) patch centres in pixels of the resized images
+    reference_xy: NDArray[np.int64]
 
 
 class Reason(StrEnum):

@@ -60,11 +60,15 @@ def resolve_weights(weights: str) -> Path:
     if weights in PUBLISHED:
         path = PUBLISHED[weights].path
         if not path.exists():
-            raise ModelError(f"weights {weights!r} are not on this machine ({path}); fetch them with: pnv weights fetch {weights}")
+            raise ModelError(
+                f"weights {weights!r} are not on this machine ({path}); fetch them with: pnv weights fetch {weights}"
+            )
         return path
     path = Path(weights).expanduser()
     if not path.is_file():
-        raise ModelError(f"weights {weights!r}: no such file; allowed: default, {', '.join(PUBLISHED)}, or a model file")
+        raise ModelError(
+            f"weights {weights!r}: no such file; allowed: default, {', '.join(PUBLISHED)}, or a model file"
+        )
     return path
 
 
@@ -143,4 +147,6 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
         raise ModelError(f"{url}: the server answered {error.code} {error.reason}") from None
     except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
         reason = getattr(error, "reason", error)
-        raise ModelError(f"{url}: cannot be reached ({reason}); check the network, or copy the file to {part.parent} by hand") from None
+        raise ModelError(
+            f"{url}: cannot be reached ({reason}); check the network, or copy the file to {part.parent} by hand"
+        ) from None

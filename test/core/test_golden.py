@@ -77,7 +77,9 @@ def described(checkpoint, photos):
     def make(clusters, width, height, count):
         key = (clusters, width, height)
         if key not in cache:
-            config = Config.make(image_width=width, image_height=height, patch_sizes=SIZES, patch_weights=(0.45, 0.15, 0.4))
+            config = Config.make(
+                image_width=width, image_height=height, patch_sizes=SIZES, patch_weights=(0.45, 0.15, 0.4)
+            )
             cache[key] = Describer(load_checkpoint(checkpoint(clusters)), config), []
         describer, done = cache[key]
         while len(done) < count:
@@ -140,7 +142,9 @@ def test_matches_and_scores_of_all_pairs_equal_the_exact_ones(golden, described,
     _, descriptors = described(clusters, 320, 240, 10)
     differing = 0
     for s, size in enumerate(SIZES):
-        offsets = arrays[f"mnn_offsets_exact_p{size}" if f"mnn_offsets_exact_p{size}" in arrays else f"mnn_offsets_p{size}_exact"]
+        offsets = arrays[
+            f"mnn_offsets_exact_p{size}" if f"mnn_offsets_exact_p{size}" in arrays else f"mnn_offsets_p{size}_exact"
+        ]
         db, q = (arrays[f"mnn_{side}_p{size}_exact"] for side in ("db", "q"))
         for i in range(10):
             for j in range(10):
@@ -175,7 +179,12 @@ def test_ransac_inliers_lie_within_the_spread_of_opencv_versions(shared, golden)
             for t in range(100):
                 part = slice(offsets[t], offsets[t + 1])
                 score, inlier = ransac_score(grid, grid, (q[part].astype(np.int64), db[part].astype(np.int64)))
-                assert low[s, t // 10, t % 10] <= inlier.sum() <= high[s, t // 10, t % 10], (name, size, t, cv2.__version__)
+                assert low[s, t // 10, t % 10] <= inlier.sum() <= high[s, t // 10, t % 10], (
+                    name,
+                    size,
+                    t,
+                    cv2.__version__,
+                )
                 assert score == inlier.sum() / (grid.rows * grid.cols)
 
 
@@ -264,7 +273,9 @@ def test_every_stage_equals_the_reference_without_a_network(golden):
         assert np.allclose(whole, stage["vlad_global_pca"], atol=1e-5)
         grids = []
         for image in range(2):
-            arrays = patch_descriptors(x[image], weights[image], netvlad.centroids, projection, bias, (h, w), SIZES, (1, 1, 1))
+            arrays = patch_descriptors(
+                x[image], weights[image], netvlad.centroids, projection, bias, (h, w), SIZES, (1, 1, 1)
+            )
             grids.append([PatchGrid(p, h - p + 1, w - p + 1, a.numpy()) for p, a in zip(SIZES, arrays, strict=True)])
             for size, array in zip(SIZES, arrays, strict=True):
                 assert_like_float32_integral(array.T, stage[f"patch_pca_p{size}"][image])
@@ -289,7 +300,9 @@ def test_every_matching_case_scores_as_the_reference(shared, golden):
     cases = golden("cases")
     grid = grid_of(np.empty((0, 128), np.float32), 5, 640, 480)
     patches, extent = grid.rows * grid.cols, (grid.cols - 1) ** 2 + (grid.rows - 1) ** 2
-    names = sorted({key[: -len("_scores")] for key in cases.files if key.endswith("_scores") and not key.startswith("zs_")})
+    names = sorted(
+        {key[: -len("_scores")] for key in cases.files if key.endswith("_scores") and not key.startswith("zs_")}
+    )
     assert len(names) >= 10
     for name in names:
         matches = cases[f"{name}_q"].astype(np.int64), cases[f"{name}_db"].astype(np.int64)
@@ -297,4 +310,6 @@ def test_every_matching_case_scores_as_the_reference(shared, golden):
         assert rapid_spatial_score(grid, grid, matches) == pytest.approx(-rapid / extent, abs=1e-6), name
         given, inlier = ransac_score(grid, grid, matches)
         assert 0.0 <= given <= 1.0 and inlier.shape == matches[0].shape
-        assert given == pytest.approx(-ransac, abs=(2 if "noise" in name or "random" in name else 0) / patches + 1e-12), name
+        assert given == pytest.approx(
+            -ransac, abs=(2 if "noise" in name or "random" in name else 0) / patches + 1e-12
+        ), name

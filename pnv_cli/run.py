@@ -1,0 +1,117 @@
+"""pnv run --images DIR | --video FILE | --bag DIR  --csv OUT.csv [--all]"""
+
+import argparse
+import csv
+import io
+import sys
+import time
+from collections.abc import Iterator
+
+from tqdm import tqdm
+
+from pnv_cli.common import add_config_flags, config_from, writable
+from pnv_cli.sources import FrameSource, bag, image_folder, video
+from pnv_core.describer import describer_from
+from pnv_core.errors import ConfigError, PnvError
+from pnv_core.files import atomic_write
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.timing import StageTimer
+from pnv_core.types import LoopClosure
+
+COLUMNS = (
+    "query",
+    "match",
+    "query_stamp",
+    "match_stamp",
+    "score",
+    "similarity",
+    "spatial",
+    "inliers",
+    "accepted",
+    "reason",
+)
+
+
+def add_parser(subparsers: argparse._SubParsersAction) -> None:
+    parser = subparsers.add_parser("run", help="loop closures of a sequence", allow_abbrev=False)
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--images", metavar="DIR", help="images in name order")
+    source.add_argument("--video", metavar="FILE")
+    source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")
+    parser.add_argument("--topic", help="image topic of the bag; default all image topics")
+    parser.add_argument("--fps", type=float, default=10.0, help="stamps of --images; default 10")
+    parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
+    parser.add_argument("--csv", required=True, metavar="OUT.csv", help="one row per accepted closure")
+    parser.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
+    parser.add_argument("--timing", action="store_true", help="print the time of each stage")
+    add_config_flags(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    output = writable(args.csv)
+    config = config_from(args)
+    source = _source(args)
+    timer = StageTimer(time.perf_counter)
+    recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
+    names: dict[int, str] = {}  # by stamp
+    rows: list[dict] = []
+    done = 0
+    try:
+        for name, frame in tqdm(
+            source.frames, total=source.count or None, unit="frame", disable=not sys.stderr.isatty()
+        ):
+            names[frame.stamp_ns] = name
+            rows += [_row(c, names) for c in _reported(recognizer.process(frame), args.all)]
+            done += 1
+    finally:  # an interrupted run keeps what it found
+        _write(output, rows)
+    if not done:
+        raise PnvError("no frame of the input could be read")
+    accepted = sum(row["accepted"] for row in rows)
+    print(f"{done} frames, {len(recognizer.database)} keyframes, {accepted} closures -> {output}")
+    if args.timing:
+        for stage, (median, late) in timer.summary_ms().items():
+            print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms")
+    return 0
+
+
+def _source(args: argparse.Namespace) -> FrameSource:
+    if not 0.001 <= args.fps <= 10000:
+        raise ConfigError(f"--fps {args.fps}; allowed: 0.001 to 10000")
+    if args.images:
+        return image_folder(args.images, args.fps, args.timestamps)
+    return video(args.video) if args.video else bag(args.bag, args.topic)
+
+
+def _reported(closures: list[LoopClosure], best_of_every_query: bool) -> Iterator[LoopClosure]:
+    accepted = [c for c in closures if c.accepted]
+    yield from accepted or (closures[:1] if best_of_every_query else [])
+
+
+def _row(closure: LoopClosure, names: dict[int, str]) -> dict:
+    return {
+        "query": names[closure.query.stamp_ns],
+        "match": names[closure.match.stamp_ns],
+        "query_stamp": _seconds(closure.query.stamp_ns),
+        "match_stamp": _seconds(closure.match.stamp_ns),
+        "score": f"{closure.score:.6f}",
+        "similarity": f"{closure.similarity:.6f}",
+        "spatial": f"{closure.spatial:.6f}",
+        "inliers": closure.inliers,
+        "accepted": int(closure.accepted),
+        "reason": str(closure.reason),
+    }
+
+
+def _seconds(stamp_ns: int) -> str:
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+
+
+def _write(path, rows: list[dict]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())

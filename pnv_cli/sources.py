@@ -1,0 +1,122 @@
+"""Where frames come from: a folder of images, a video, a rosbag2. Each gives (name, Frame) in order."""
+
+import csv
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from msg_adapters.images import message_to_frame
+from pnv_core.errors import ImageError, PnvError
+from pnv_core.images import list_images, read_image
+from pnv_core.types import Frame
+
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+
+
+@dataclass(frozen=True)
+class FrameSource:
+    """Named frames in the order they are to be processed; `count` is how many, 0 if unknown."""
+
+    count: int
+    frames: Iterator[tuple[str, Frame]]
+
+
+def image_folder(folder: str, fps: float, timestamps: str | None) -> FrameSource:
+    """The images of a folder in name order, stamped by `fps` or by a CSV of frame,timestamp (seconds)."""
+    paths = list_images(folder)
+    stamps = (
+        _read_timestamps(timestamps, [p.name for p in paths])
+        if timestamps
+        else [round(i * 1e9 / fps) for i in range(len(paths))]
+    )
+
+    def frames() -> Iterator[tuple[str, Frame]]:
+        for path, stamp in zip(paths, stamps, strict=True):
+            try:
+                yield path.name, Frame(stamp, "camera", read_image(path))
+            except ImageError as error:
+                print(f"pnv: skipped: {error}", file=sys.stderr)
+
+    return FrameSource(len(paths), frames())
+
+
+def _read_timestamps(path: str, names: list[str]) -> list[int]:
+    """Nanoseconds per image name; they must grow. Raises PnvError naming the first row that is wrong."""
+    stamps: dict[str, int] = {}
+    with open(path, newline="") as file:
+        rows = csv.DictReader(file)
+        if not {"frame", "timestamp"} <= set(rows.fieldnames or ()):
+            raise PnvError(f"{path}: has the columns {rows.fieldnames}; allowed: frame, timestamp")
+        for row in rows:
+            try:
+                seconds, _, fraction = row["timestamp"].strip().partition(".")
+                stamps[row["frame"].strip()] = int(seconds) * 10**9 + int((fraction + "0" * 9)[:9])
+            except (ValueError, AttributeError):
+                raise PnvError(
+                    f"{path} line {rows.line_num}: timestamp {row['timestamp']!r}; allowed: seconds"
+                ) from None
+    by_stem = {Path(name).stem: stamp for name, stamp in stamps.items()}
+    found = [stamps.get(name, by_stem.get(Path(name).stem)) for name in names]
+    if None in found:
+        raise PnvError(f"{path}: no timestamp for {names[found.index(None)]}")
+    for i in range(1, len(found)):
+        if found[i] <= found[i - 1]:  # type: ignore[operator]
+            raise PnvError(f"{path}: the timestamp of {names[i]} is not later than that of {names[i - 1]}")
+    return found  # type: ignore[return-value]
+
+
+def video(path: str) -> FrameSource:
+    """The frames of a video file, stamped by its own frame times."""
+    if not Path(path).is_file():
+        raise PnvError(f"{path}: no such video file")
+    capture = cv2.VideoCapture(path)
+    if not capture.isOpened():
+        raise PnvError(f"{path}: cannot be opened as a video")
+    fps = capture.get(cv2.CAP_PROP_FPS) or 30.0
+
+    def frames() -> Iterator[tuple[str, Frame]]:
+        number = 0
+        try:
+            while True:
+                ok, bgr = capture.read()
+                if not ok:
+                    return
+                yield str(number), Frame(round(number * 1e9 / fps), "camera", cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+                number += 1
+        finally:
+            capture.release()
+
+    return FrameSource(max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT))), frames())
+
+
+def bag(folder: str, topic: str | None) -> FrameSource:
+    """The images of a rosbag2 (sqlite3 or mcap), stamped by their headers; all image topics, or the one named."""
+    from rosbags.highlevel import AnyReader, AnyReaderError
+    from rosbags.typesys import Stores, get_typestore
+
+    if not Path(folder).exists():
+        raise PnvError(f"{folder}: no such bag")
+    try:
+        reader = AnyReader([Path(folder)], default_typestore=get_typestore(Stores.ROS2_JAZZY))
+        reader.open()
+    except (AnyReaderError, OSError, ValueError) as error:
+        raise PnvError(f"{folder}: cannot be read as a rosbag2 ({error})") from None
+    offered = [c for c in reader.connections if c.msgtype in IMAGE_TYPES]
+    chosen = [c for c in offered if topic is None or c.topic == topic]
+    if not chosen:
+        topics = ", ".join(sorted({c.topic for c in offered})) or "none"
+        reader.close()
+        raise PnvError(f"{folder}: no images on {topic or 'any topic'}; image topics in the bag: {topics}")
+
+    def frames() -> Iterator[tuple[str, Frame]]:
+        with reader:
+            for number, (connection, _, raw) in enumerate(reader.messages(chosen)):
+                try:
+                    yield str(number), message_to_frame(reader.deserialize(raw, connection.msgtype), connection.topic)
+                except ImageError as error:
+                    print(f"pnv: skipped image {number} of {connection.topic}: {error}", file=sys.stderr)
+
+    return FrameSource(sum(c.msgcount for c in chosen), frames())
