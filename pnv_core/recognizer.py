@@ -56,6 +56,20 @@ class PlaceRecognizer:
         ranked = sorted(closures, key=lambda c: (-c.score, -c.similarity, c.match.id))
         return [self._decided(query, descriptor, c) for c in ranked]
 
+    def change(self, config: Config) -> None:
+        """Take the live settings of another Config, from the next frame on."""
+        self.config = self.keyframes.config = config
+
+    def new_session(self) -> None:
+        """What comes next is another run: its stamps may lie before those already seen."""
+        self.database.new_session()
+        self.keyframes.forget()
+
+    def reset(self) -> None:
+        """Forget every keyframe."""
+        self.database.clear()
+        self.keyframes.forget()
+
     def _examined(self, query: ImageRef, descriptor: PlaceDescriptor, ref: ImageRef, similarity: float, reference: PlaceDescriptor) -> LoopClosure:
         spatial = self.reranker.score(descriptor, reference)
         score = self.calibration.probability(Evidence(similarity, spatial.score, spatial.inliers))
