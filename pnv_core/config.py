@@ -82,7 +82,7 @@ class Config:
     time_budget_ms: float = setting(
         0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, high=1e6, live=True
     )
-    index: str = setting("auto", "index of the global vectors", choices=("auto", "exact", "hnsw", "ivfpq"))
+    index: str = setting("auto", "index of the global vectors", choices=("auto", "exact", "pq", "hnsw", "ivfpq"))
 
     # Re-ranking
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
@@ -99,6 +99,8 @@ class Config:
     )
     eviction: str = setting("oldest", "what goes when the budget is full", choices=("oldest", "densest"))
     patch_store: str = setting("memory", "where patches of old keyframes live", choices=("memory", "disk"))
+    patch_folder: str = setting("", "folder of the patches on disk; empty = /var/tmp")
+    disk_budget_gb: float = setting(32.0, "bound on the patches on disk", unit="GB", low=0.0, high=1e6)
     patch_precision: str = setting("float16", "precision of stored patches", choices=("float32", "float16", "int8"))
 
     def __post_init__(self) -> None:

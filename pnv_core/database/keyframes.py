@@ -1,15 +1,18 @@
 """KeyframeDatabase. N = keyframes, D = dimension of the global vector."""
 
+import logging
 import threading
 from bisect import bisect_left
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.database.eviction import make_eviction
-from pnv_core.database.index import ExactIndex, VectorIndex
+from pnv_core.database.index import make_index
 from pnv_core.database.patch_codes import (
     DTYPES,
     GridLayout,
@@ -19,6 +22,7 @@ from pnv_core.database.patch_codes import (
     layout_of,
     views,
 )
+from pnv_core.database.patch_file import DiskBuffer, PatchFile
 from pnv_core.database.vectors import Row, VectorTable
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.types import ImageRef, PlaceDescriptor
@@ -26,6 +30,8 @@ from pnv_core.types import ImageRef, PlaceDescriptor
 MB = 1_000_000
 # Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
 OBJECT_BYTES = 1500
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +44,15 @@ class StoredKeyframe:
     vector: NDArray[np.float32]  # (D,), a row of the vector table, valid while `row` lives
     row: Row
     layouts: tuple[GridLayout, ...]
-    buffer: NDArray[np.uint8]
+    buffer: NDArray[np.uint8] | DiskBuffer
     texture: float
 
+    def read(self) -> NDArray[np.uint8]:
+        """The patches' buffer, from disk if it lies there. Raises OSError."""
+        return self.buffer.read() if isinstance(self.buffer, DiskBuffer) else self.buffer
+
     def patches(self) -> tuple[PatchCodes, ...]:
-        return views(self.buffer, self.layouts)
+        return views(self.read(), self.layouts)
 
     def descriptor(self) -> PlaceDescriptor:
         return PlaceDescriptor(self.vector.copy(), tuple(codes.grid() for codes in self.patches()), self.texture)
@@ -52,10 +62,10 @@ class StoredKeyframe:
 class Snapshot:
     """The database at one moment, for saving in another thread while frames go on."""
 
+    lineage: object  # the same for snapshots of one database between loads: an id then means one keyframe
     dim: int
-    precision: str
     next_id: int
-    session: int
+    next_session: int
     keyframes: list[StoredKeyframe]  # by ascending id
 
 
@@ -68,10 +78,29 @@ class DatabaseStats:
     bytes_budget: int
     evicted: int
     sessions: int
+    disk_bytes: int = 0
 
     @property
     def bytes_free(self) -> int:
         return self.bytes_budget - self.bytes_used
+
+
+class Restorable(Protocol):
+    """A keyframe as a saved map gives it."""
+
+    @property
+    def ref(self) -> ImageRef: ...
+
+    @property
+    def vector(self) -> NDArray[np.float32]: ...
+
+    @property
+    def layouts(self) -> tuple[GridLayout, ...]: ...
+
+    @property
+    def texture(self) -> float: ...
+
+    def read(self) -> NDArray[np.uint8]: ...
 
 
 class KeyframeDatabase:
@@ -90,15 +119,22 @@ class KeyframeDatabase:
         patch_store: str = "memory",
         patch_precision: str = "float16",
         read_only: bool = False,
+        patch_folder: str = "",
+        disk_budget_gb: float = 32.0,
     ) -> None:
         if patch_precision not in DTYPES:
             allowed = ", ".join(DTYPES)
             raise ConfigError(f"patch_precision = {patch_precision!r} is out of range; allowed: one of {allowed}")
+        if patch_store not in ("memory", "disk"):
+            raise ConfigError(f"patch_store = {patch_store!r} is out of range; allowed: one of memory, disk")
         self.dim = dim
         self.bytes_budget = int(memory_budget_mb * MB)
         self.patch_precision = patch_precision
         self.read_only = read_only
         self._eviction_name = eviction
+        self._index_name = index
+        self._patch_file = PatchFile(patch_folder, int(disk_budget_gb * 1e9)) if patch_store == "disk" else None
+        self._disk_failed = False
         self._lock = threading.Lock()
         self._session = 0
         self._next_id = 0
@@ -107,10 +143,12 @@ class KeyframeDatabase:
         self._start_empty()
 
     def _start_empty(self) -> None:
+        self._lineage = object()
         self._eviction = make_eviction(self._eviction_name)
-        least = self.dim * 4 + OBJECT_BYTES
-        self._table = VectorTable(max(1, self.bytes_budget // least), self.dim)
-        self._index: VectorIndex = ExactIndex(self._table)
+        most = self.bytes_budget // (self.dim * 4 + OBJECT_BYTES) + 1
+        self._table = VectorTable(2 * most, self.dim)  # twice: a snapshot may hold on to every row it saw
+        self._index = make_index(self._index_name, self._table)
+        self._in_memory: dict[int, None] = {}  # ids whose patches are in memory, oldest first
         self._keyframes: dict[int, StoredKeyframe] = {}
         self._ids: list[int] = []  # ascending
         self._cameras: dict[str, int] = {}
@@ -126,6 +164,8 @@ class KeyframeDatabase:
             patch_store=config.patch_store,
             patch_precision=config.patch_precision,
             read_only=read_only,
+            patch_folder=config.patch_folder,
+            disk_budget_gb=config.disk_budget_gb,
         )
 
     def __len__(self) -> int:
@@ -142,20 +182,25 @@ class KeyframeDatabase:
     @property
     def bytes_used(self) -> int:
         """Bytes of vectors, patches and index, and an allowance for the objects that hold them."""
-        return self._patch_bytes + len(self._ids) * self._fixed_bytes
+        return self._bytes_with(0)
+
+    def _bytes_with(self, more: int) -> int:
+        """Bytes used once `more` further keyframes without patches are in."""
+        return (
+            self._patch_bytes
+            + (len(self._ids) + more) * OBJECT_BYTES
+            + self._table.nbytes(more)
+            + self._index.nbytes(more)
+        )
 
     @property
     def evicted(self) -> int:
         """Keyframes given up so far to stay within the budget."""
         return self._evicted
 
-    @property
-    def _fixed_bytes(self) -> int:
-        return self._table.row_bytes + self._index.row_bytes + OBJECT_BYTES
-
     def bytes_per_keyframe(self, descriptor: PlaceDescriptor) -> int:
         """Bytes this keyframe would take, known before it is added."""
-        return self._fixed_bytes + buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
+        return self._table.row_bytes + OBJECT_BYTES + buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
 
     def stats(self) -> DatabaseStats:
         with self._lock:
@@ -164,7 +209,8 @@ class KeyframeDatabase:
                 bytes_used=self.bytes_used,
                 bytes_budget=self.bytes_budget,
                 evicted=self._evicted,
-                sessions=len({self._keyframes[i].ref.session for i in self._ids}),
+                sessions=len(np.unique(self._table.sessions[: self._table.high][self._table.live[: self._table.high]])),
+                disk_bytes=self._patch_file.end if self._patch_file else 0,
             )
 
     def add(self, stamp_ns: int, camera: str, descriptor: PlaceDescriptor) -> ImageRef:
@@ -176,20 +222,48 @@ class KeyframeDatabase:
             raise PnvError("the database is read-only (localisation mode); allowed: queries")
         vector = _unit_vector(descriptor.global_vector, self.dim)
         layouts = self._shared(layout_of(descriptor.patches, self.patch_precision))
-        need = self._fixed_bytes + buffer_bytes(layouts)
-        if need > self.bytes_budget:
-            raise PnvError(
-                f"one keyframe takes {need / MB:.3g} MB; memory_budget_mb allows {self.bytes_budget / MB:.3g}"
-            )
         buffer = encode(descriptor.patches, layouts)
         with self._lock:
-            while self._ids and (self.bytes_used + need > self.bytes_budget or self._table.full):
-                self._remove(self._eviction.choose())
-                self._evicted += 1
+            self._make_room(len(buffer))
             ref = ImageRef(self._next_id, stamp_ns, camera, self._session)
             self._next_id += 1
             self._insert(ref, vector, layouts, buffer, descriptor.texture)
         return ref
+
+    def _make_room(self, patch_bytes: int) -> None:
+        need = OBJECT_BYTES + self._table.row_bytes + patch_bytes
+        if need > self.bytes_budget:
+            raise PnvError(
+                f"one keyframe takes {need / MB:.3g} MB; memory_budget_mb = {self.bytes_budget / MB:g} given"
+            )
+        while self._bytes_with(1) + patch_bytes > self.bytes_budget:
+            if self._spill():
+                continue
+            if self._ids:
+                self._remove(self._eviction.choose())
+                self._evicted += 1
+            else:
+                self._start_empty()  # rows and codes of smaller keyframes than this one filled the budget
+
+    def _spill(self) -> bool:
+        """Move the oldest patches in memory to disk, if that is allowed and possible."""
+        if self._patch_file is None or not self._in_memory:
+            return False
+        keyframe = next(iter(self._in_memory))
+        stored = self._keyframes[keyframe]
+        try:
+            place = self._patch_file.write(stored.buffer)
+        except OSError as error:
+            if not self._disk_failed:
+                _log.warning("patches stay in memory: %s: %s", self._patch_file.folder, error.strerror)
+            self._disk_failed = True
+            return False
+        if place is None:
+            return False
+        self._keyframes[keyframe] = replace(stored, buffer=place)
+        self._patch_bytes -= place.nbytes
+        del self._in_memory[keyframe]
+        return True
 
     def _insert(
         self,
@@ -205,13 +279,16 @@ class KeyframeDatabase:
         self._keyframes[ref.id] = StoredKeyframe(ref, kept, row, layouts, buffer, texture)
         self._ids.append(ref.id)
         self._patch_bytes += len(buffer)
+        self._in_memory[ref.id] = None
         self._index.add(row.slot)
         self._eviction.added(ref, kept)
 
     def _remove(self, keyframe: int) -> None:
         stored = self._keyframes.pop(keyframe)
         del self._ids[bisect_left(self._ids, keyframe)]
-        self._patch_bytes -= len(stored.buffer)
+        if keyframe in self._in_memory:
+            self._patch_bytes -= len(stored.buffer)
+            del self._in_memory[keyframe]
         self._index.remove(stored.row.slot)
         self._eviction.removed(stored.ref)
         self._table.remove(stored.row)
@@ -300,7 +377,33 @@ class KeyframeDatabase:
         """The database at this moment; costs a list, not a copy of the keyframes."""
         with self._lock:
             keyframes = [self._keyframes[i] for i in self._ids]
-            return Snapshot(self.dim, self.patch_precision, self._next_id, self._session, keyframes)
+            return Snapshot(self._lineage, self.dim, self._next_id, self._session + 1, keyframes)
+
+    def restore(self, keyframes: Iterable["Restorable"], next_id: int, next_session: int) -> object:
+        """Replace the contents by keyframes of a saved map, by ascending id, and begin a new session.
+
+        Gives the lineage of later snapshots. Raises PnvError, leaving the database empty, when they exceed the budget.
+        """
+        with self._lock:
+            self._start_empty()
+            try:
+                for kf in keyframes:
+                    self._take_back(kf)
+            except BaseException:
+                self._start_empty()
+                raise
+            self._next_id, self._session = next_id, next_session
+            return self._lineage
+
+    def _take_back(self, kf: "Restorable") -> None:
+        buffer = np.frombuffer(kf.read(), np.uint8)
+        while self._bytes_with(1) + len(buffer) > self.bytes_budget:
+            if not self._spill():
+                raise PnvError(
+                    f"the map takes more than memory_budget_mb = {self.bytes_budget / MB:g} "
+                    f"({len(self._ids)} keyframes fit); allowed: a larger budget, patch_store = disk, or a pruned map"
+                )
+        self._insert(kf.ref, kf.vector, self._shared(kf.layouts), buffer, kf.texture)
 
 
 def _unit_vector(vector: NDArray, dim: int) -> NDArray[np.float32]:

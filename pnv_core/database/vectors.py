@@ -64,9 +64,9 @@ class VectorTable:
         """Bytes of one row over all columns."""
         return self.dim * 4 + 8 + 8 + 4 + 2 + 1
 
-    @property
-    def full(self) -> bool:
-        return not self._free and self.high == len(self.live)
+    def nbytes(self, more: int = 0) -> int:
+        """Bytes of the rows ever used, now or after `more` further rows."""
+        return max(self.high, self.high + more - len(self._free)) * self.row_bytes
 
     def add(self, vector: NDArray[np.float32], keyframe: int, stamp_ns: int, session: int, camera: int) -> Row:
         """Raises IndexError when full."""
