@@ -35,7 +35,9 @@ def read_image(path: Path | str) -> NDArray[np.uint8]:
     except UnidentifiedImageError:
         empty = Path(path).stat().st_size == 0
         raise ImageError(f"{path}: {'is empty' if empty else 'is no image'}; allowed: {', '.join(SUFFIXES)}") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Image.DecompressionBombError:  # Pillow refuses the largest before their size can be asked
+        raise ImageError(f"{path}: too many pixels; allowed: up to {MAX_PIXELS // 10**6} megapixels") from None
+    except (OSError, SyntaxError, ValueError) as error:
         raise ImageError(f"{path}: cannot be decoded ({str(error)[:120]})") from None
 
 

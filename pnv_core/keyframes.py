@@ -24,7 +24,9 @@ class KeyframeSelector:
     def differs(self, frame: Frame, descriptor: PlaceDescriptor) -> bool:
         """Whether 1 - cosine to the camera's last keyframe is at least `min_change`."""
         last = self._last.get(frame.camera)
-        return last is None or 1.0 - float(last[1] @ descriptor.global_vector) >= self.config.min_change
+        if last is None or self.config.min_change == 0.0:
+            return True
+        return 1.0 - float(last[1] @ descriptor.global_vector) >= self.config.min_change
 
     def take(self, frame: Frame, descriptor: PlaceDescriptor) -> None:
         self._last[frame.camera] = frame.stamp_ns, descriptor.global_vector

@@ -234,7 +234,8 @@ def test_fused_rapid_scores_equal_the_exact_ones(golden, clusters):
 def assert_like_float32_integral(given, reference):
     """(D, n) columns agree with the reference's up to the cancellation of its float32 integral map."""
     cosine = (np.asarray(given, np.float64) * reference).sum(0)
-    assert np.median(1 - cosine) < 1e-6 and (1 - cosine).max() < 1e-3, (np.median(1 - cosine), (1 - cosine).max())
+    assert np.median(1 - cosine) < 1e-6
+    assert (1 - cosine).max() < 1e-3
 
 
 def exact_vlads(stage, size):
@@ -290,7 +291,8 @@ def test_every_stage_equals_the_reference_without_a_network(golden):
         query, reference = grids[0][s], grids[1][s]
         assert np.array_equal(query.keypoints().T, stage[f"keypoints_p{size}"])
         q, r = mutual_nearest(query.descriptors, reference.descriptors)
-        assert np.array_equal(q, stage[f"mutual_q_p{size}"]) and np.array_equal(r, stage[f"mutual_db_p{size}"])
+        assert np.array_equal(q, stage[f"mutual_q_p{size}"])
+        assert np.array_equal(r, stage[f"mutual_db_p{size}"])
         extent = (query.cols - 1) ** 2 + (query.rows - 1) ** 2
         assert rapid_spatial_score(query, reference, (q, r)) == pytest.approx(-stage["spatial"][s] / extent, abs=1e-6)
 
@@ -309,7 +311,8 @@ def test_every_matching_case_scores_as_the_reference(shared, golden):
         ransac, rapid, _ = cases[f"{name}_scores"]
         assert rapid_spatial_score(grid, grid, matches) == pytest.approx(-rapid / extent, abs=1e-6), name
         given, inlier = ransac_score(grid, grid, matches)
-        assert 0.0 <= given <= 1.0 and inlier.shape == matches[0].shape
+        assert 0.0 <= given <= 1.0
+        assert inlier.shape == matches[0].shape
         assert given == pytest.approx(
             -ransac, abs=(2 if "noise" in name or "random" in name else 0) / patches + 1e-12
         ), name
