@@ -9,7 +9,8 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 
-# torch of PyPI carries CUDA (about 3 GB); the same release without it is taken where its index can be reached.
+# torch of PyPI carries CUDA (about 3 GB); this release is taken without it wherever an index offers it so (version +cpu).
+TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
@@ -21,7 +22,8 @@ $(READY): setup.py setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	    { echo "python3 -m venv failed; on Debian: apt-get install python3-venv" >&2; exit 2; }
 	$(BIN)/python -c "import torch" 2>/dev/null || \
-	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q torch --extra-index-url $(TORCH_CPU); fi
+	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q $(TORCH) --extra-index-url $(TORCH_CPU); \
+	    else $(BIN)/pip install --progress-bar off -q $(TORCH); fi
 	$(BIN)/pip install --progress-bar off -q -e ".[ros,dev]"
 	touch $@
 
