@@ -32,25 +32,23 @@ COLUMNS = (
 
 NO_CAMERA = -1  # a match in a saved map whose camera is not among the topics of this run
 
-_TABLE = np.dtype(
-    [
-        ("query_sec", "<i4"),
-        ("query_nsec", "<u4"),
-        ("match_sec", "<i4"),
-        ("match_nsec", "<u4"),
-        ("query_id", "<f8"),  # PointField has no 64 bit integer; exact up to 2**53
-        ("match_id", "<f8"),
-        ("query_camera", "<i4"),
-        ("match_camera", "<i4"),
-        ("score", "<f4"),
-        ("similarity", "<f4"),
-        ("spatial", "<f4"),
-        ("inliers", "<i4"),
-        ("accepted", "<u1"),
-        ("reason", "<u1"),
-        ("padding", "V6"),  # rows stay aligned to 8 bytes
-    ]
-)
+_FIELDS = {
+    "query_sec": "<i4",
+    "query_nsec": "<u4",
+    "match_sec": "<i4",
+    "match_nsec": "<u4",
+    "query_id": "<f8",  # PointField has no 64 bit integer; exact up to 2**53
+    "match_id": "<f8",
+    "query_camera": "<i4",
+    "match_camera": "<i4",
+    "score": "<f4",
+    "similarity": "<f4",
+    "spatial": "<f4",
+    "inliers": "<i4",
+    "accepted": "<u1",
+    "reason": "<u1",
+}
+_TABLE = np.dtype([*_FIELDS.items(), ("padding", "V6")])  # rows stay aligned to 8 bytes
 _POINT_TYPES = {
     "i4": PointField.INT32,
     "u4": PointField.UINT32,
@@ -158,11 +156,10 @@ def candidates_to_message(
     message.header.frame_id = frame_id
     if closures:
         message.header.stamp = to_time(closures[0].query.stamp_ns)
-    message.fields = [
-        PointField(name=name, offset=_TABLE.fields[name][1], datatype=_POINT_TYPES[_TABLE[name].str[1:]], count=1)
-        for name in _TABLE.names
-        if name != "padding"
-    ]
+    offset = 0
+    for name, kind in _FIELDS.items():
+        message.fields.append(PointField(name=name, offset=offset, datatype=_POINT_TYPES[kind[1:]], count=1))
+        offset += np.dtype(kind).itemsize
     message.data = table.tobytes()
     return message
 

@@ -1,5 +1,74 @@
-"""The executable `place_recognizer`."""
+"""The executable `place_recognizer`: one node, ended by SIGINT, SIGTERM or its own failure."""
+
+import signal
+import sys
+import threading
+import traceback
+from queue import SimpleQueue
+
+import rclpy
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
+
+from pnv_core.errors import PnvError
+from pnv_ros.node import PlaceRecognizerNode
+
+UNUSABLE_INPUT = 2
 
 
-def main() -> int:
-    return 0
+class Spinning:
+    """Callbacks in a thread of their own, so that the main thread is free to hear signals."""
+
+    def __init__(self, node: PlaceRecognizerNode, failed: "SimpleQueue[BaseException | int]") -> None:
+        self._executor, self._failed, self._ended = SingleThreadedExecutor(), failed, threading.Event()
+        self._executor.add_node(node)
+        self._thread = threading.Thread(target=self._spin, name="callbacks", daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        try:
+            while not self._ended.is_set():
+                self._executor.spin_once()
+        except BaseException as failure:
+            self._failed.put(failure)
+
+    def end(self) -> None:
+        """Returns when the callback in hand is done."""
+        self._ended.set()
+        self._executor.create_task(lambda: None)  # ends the wait
+        self._thread.join()
+        self._executor.shutdown()
+
+
+def main(args: list[str] | None = None) -> int:
+    """0 after SIGINT or SIGTERM, 2 for unusable settings, 1 with the traceback after a failure."""
+    ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda number, _: ending.put(number))
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        try:
+            node = PlaceRecognizerNode(failed=ending.put)
+        except (PnvError, InvalidParameterValueException, InvalidParameterTypeException) as error:
+            print(f"place_recognizer: {error}", file=sys.stderr)
+            return UNUSABLE_INPUT
+        if node.settings.node.autostart and not node.start():
+            return UNUSABLE_INPUT
+        spinning = Spinning(node, ending)
+        end = ending.get()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)  # a second one ends at once
+        if isinstance(end, BaseException):
+            node.report_failure(end)
+            traceback.print_exception(end)
+        spinning.end()
+        node.stop()
+        node.destroy_node()
+        return 1 if isinstance(end, BaseException) else 0
+    finally:
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

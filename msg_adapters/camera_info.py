@@ -1,0 +1,43 @@
+"""sensor_msgs/CameraInfo to a rectification of images."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.errors import ImageError
+
+PINHOLE = ("plumb_bob", "rational_polynomial")
+FISHEYE = ("equidistant", "fisheye")
+
+
+class Rectifier:
+    """Removes lens distortion as a CameraInfo describes it; the maps are computed once.
+
+    Raises ImageError for an uncalibrated camera or a distortion model other than the ones above.
+    """
+
+    def __init__(self, info: Any) -> None:
+        self.size = int(info.width), int(info.height)
+        k, d = np.array(info.k, np.float64).reshape(3, 3), np.array(info.d, np.float64)
+        if not k[0, 0] > 0 or 0 in self.size:
+            raise ImageError(f"camera info of {self.size[0]}x{self.size[1]} has focal length {k[0, 0]:g}; "
+                             "allowed: a calibrated camera")  # fmt: skip
+        model = info.distortion_model
+        if d.size and model not in PINHOLE + FISHEYE:
+            raise ImageError(f"distortion model {model!r} is unknown; allowed: {', '.join(PINHOLE + FISHEYE)}")
+        self._maps: tuple[Any, Any] | None = None
+        if d.any():
+            undistort = cv2.fisheye.initUndistortRectifyMap if model in FISHEYE else cv2.initUndistortRectifyMap
+            coefficients = d[:4] if model in FISHEYE else d
+            self._maps = undistort(k, coefficients, np.eye(3), k, self.size, cv2.CV_16SC2)
+
+    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W) or (H, W, 3) -> the same shape, 0 where nothing was seen. Raises ImageError for another size."""
+        if (pixels.shape[1], pixels.shape[0]) != self.size:
+            raise ImageError(f"image is {pixels.shape[1]}x{pixels.shape[0]}; allowed by its camera info: "
+                             f"{self.size[0]}x{self.size[1]}")  # fmt: skip
+        if self._maps is None:
+            return pixels
+        return cv2.remap(pixels, *self._maps, cv2.INTER_LINEAR)

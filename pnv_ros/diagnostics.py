@@ -1,0 +1,126 @@
+"""/diagnostics: once a second, how the node is and why."""
+
+import time
+from collections import deque
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from pnv_ros.inputs import ImageInputs
+from pnv_ros.parameters import Settings
+from pnv_ros.recognition import Recognition
+from pnv_ros.statistics import Drop, Statistics
+
+_WINDOW_S = 5.0  # rates are over this long
+_REPEAT_S = 30.0  # the log repeats that no image comes
+
+
+class Diagnostics:
+    """Watches an active node: publishes its status and warns where no image comes."""
+
+    def __init__(self, node: Node, recognition: Recognition, statistics: Statistics) -> None:
+        self._node, self._recognition, self._statistics = node, recognition, statistics
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+        self._looks: deque[tuple[float, int, int, int]] = deque()
+        self._seen: dict[str, tuple[int, float]] = {}
+        self._warned: dict[str, float] = {}
+
+    def close(self) -> None:
+        self._node.destroy_publisher(self._publisher)
+
+    def forget(self) -> None:
+        """The node was activated: waiting for images begins anew."""
+        self._looks.clear()
+        self._seen.clear()
+        self._warned.clear()
+
+    def look(self, settings: Settings, inputs: ImageInputs) -> None:
+        """Publish the status of this second."""
+        now = time.monotonic()
+        received, processed, dropped = self._statistics.totals()
+        unusable = dropped.get(Drop.UNUSABLE, 0)
+        self._looks.append((now, received, processed, unusable))
+        while now - self._looks[0][0] > _WINDOW_S and len(self._looks) > 2:
+            self._looks.popleft()
+        then, received_then, processed_then, unusable_then = self._looks[0]
+        span = max(now - then, 1e-9)
+        rates = (received - received_then) / span, (processed - processed_then) / span
+        silent = self._silent(now, settings.node.no_image_warning_s, settings.node.image_topics)
+        self._log_silence(now, {} if inputs.paused else silent, inputs)
+
+        if inputs.paused:
+            level, text = DiagnosticStatus.OK, "paused"
+        elif silent:
+            topic, seconds = next(iter(silent.items()))
+            level, text = DiagnosticStatus.WARN, f"no image for {seconds:.0f} s on {topic}: {inputs.hint(topic)}"
+        elif unusable > unusable_then:
+            level, text = DiagnosticStatus.WARN, f"{unusable - unusable_then} unusable images of late; see the log"
+        else:
+            level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
+        self.publish(level, text, self._values(rates, settings))
+
+    def _sentence(self, rates: tuple[float, float], settings: Settings) -> str:
+        score = max(self._statistics.best_scores, default=None)
+        least = settings.recogniser.accept_score
+        best = "no candidate yet" if score is None else f"best score of late {score:.2f}, accepted from {least:.2f}"
+        keyframes = len(self._recognition.recognizer.database)
+        return f"{rates[1]:.1f} of {rates[0]:.1f} frames/s, {keyframes} keyframes, {best}"
+
+    def _values(self, rates: tuple[float, float], settings: Settings) -> dict[str, str]:
+        received, processed, dropped = self._statistics.totals()
+        score = max(self._statistics.best_scores, default=None)
+        stats = self._recognition.recognizer.database.stats()
+        stages = self._recognition.recognizer.timer.summary_ms()
+        return {
+            "frames in [1/s]": f"{rates[0]:.2f}",
+            "frames processed [1/s]": f"{rates[1]:.2f}",
+            "frames in": str(received),
+            "frames processed": str(processed),
+            **{f"dropped: {why}": str(dropped.get(why, 0)) for why in Drop},
+            "keyframes": str(stats.keyframes),
+            "keyframes evicted": str(stats.evicted),
+            "memory [MB]": f"{stats.bytes_used / 1e6:.1f}",
+            "memory budget [MB]": f"{stats.bytes_budget / 1e6:.1f}",
+            "best score of late": "none" if score is None else f"{score:.3f}",
+            "accept_score": f"{settings.recogniser.accept_score:.3f}",
+            "closures": str(self._statistics.closures),
+            "last closure": self._statistics.last_closure or "none",
+            **{f"{stage} p50, p95 [ms]": f"{p50:.1f}, {p95:.1f}" for stage, (p50, p95) in stages.items()},
+        }
+
+    def _log_silence(self, now: float, silent: dict[str, float], inputs: ImageInputs) -> None:
+        for topic, seconds in silent.items():
+            if now - self._warned.get(topic, -_REPEAT_S) >= _REPEAT_S:
+                self._warned[topic] = now
+                self._node.get_logger().warning(
+                    f"no image for {seconds:.0f} s on {inputs.describe(topic)}: {inputs.hint(topic)}"
+                )
+        for topic in set(self._warned) - set(silent):
+            del self._warned[topic]
+            self._node.get_logger().info(f"images come on {topic}")
+
+    def publish(self, level: bytes, text: str, values: dict[str, str] | None = None) -> None:
+        """One status, as it is."""
+        status = DiagnosticStatus(
+            level=level,
+            name=f"{self._node.get_fully_qualified_name()}: place recognition",
+            message=text,
+            hardware_id=self._node.get_fully_qualified_name(),
+            values=[KeyValue(key=k, value=v) for k, v in (values or {}).items()],
+        )
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+
+    def _silent(self, now: float, limit_s: float, topics: tuple[str, ...]) -> dict[str, float]:
+        """Topics on which nothing came for the limit, with how long."""
+        silent = {}
+        for topic in topics:
+            count, since = self._seen.get(topic, (-1, now))
+            received = self._statistics.received[topic]
+            if received != count:
+                self._seen[topic] = received, now
+            elif now - since >= limit_s:
+                silent[topic] = now - since
+        return silent

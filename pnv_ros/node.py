@@ -1,0 +1,261 @@
+"""PlaceRecognizerNode: the managed node around the recogniser."""
+
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from sensor_msgs.msg import CameraInfo
+
+from msg_adapters.camera_info import Rectifier
+from pnv_core.describer import Describer, describer_from
+from pnv_core.errors import ImageError, PnvError
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.timing import StageTimer
+from pnv_core.types import PlaceDescriptor
+from pnv_ros.diagnostics import Diagnostics
+from pnv_ros.inputs import ImageInputs
+from pnv_ros.outputs import Outputs
+from pnv_ros.parameters import Parameters, Settings
+from pnv_ros.recognition import Recognition
+from pnv_ros.services import create_services
+from pnv_ros.slot import NewestFrames
+from pnv_ros.stamps import StampRule
+from pnv_ros.statistics import Statistics
+from pnv_ros.thumbnails import Thumbnails
+from pnv_ros.view import View, read_mask
+from pnv_ros.worker import Worker
+
+SUCCESS, FAILURE, ERROR = (
+    TransitionCallbackReturn.SUCCESS,
+    TransitionCallbackReturn.FAILURE,
+    TransitionCallbackReturn.ERROR,
+)
+NOT_CONFIGURED = "the node is not configured; allowed: configure it first"
+
+
+class PlaceRecognizerNode(LifecycleNode):
+    """configure loads the model, activate listens, deactivate keeps the map, clean-up frees everything.
+
+    A failure of the worker is handed to `failed`. Raises ConfigError for parameters that are not allowed.
+    """
+
+    def __init__(self, failed: Callable[[BaseException], None]) -> None:
+        super().__init__("place_recognizer")
+        self._failed = failed
+        self._recognition: Recognition | None = None
+        self._diagnostics: Diagnostics | None = None
+        self._inputs: ImageInputs | None = None
+        self._worker: Worker | None = None
+        self._statistics = Statistics()
+        self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
+        create_services(self, self)
+        # steady: a paused simulation or bag stops neither diagnostics nor the warning that no image comes
+        self._second = self.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._service_change_state.callback = self._changing_state(self._service_change_state.callback)
+
+    @property
+    def settings(self) -> Settings:
+        return self._declared.settings
+
+    def start(self) -> bool:
+        """Configure and activate; whether both succeeded."""
+        return self.trigger_configure() == SUCCESS and self.trigger_activate() == SUCCESS
+
+    # Life cycle
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            self._configure()
+        except (PnvError, OSError, MemoryError) as error:
+            self.get_logger().error(f"cannot be configured: {error}")
+            self._free()
+            return FAILURE
+        except Exception:
+            self.get_logger().error(f"cannot be configured:\n{traceback.format_exc()}")
+            self._free()
+            return ERROR
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        assert self._recognition is not None
+        assert self._diagnostics is not None
+        frames = NewestFrames()
+        self._diagnostics.forget()
+        self._inputs = ImageInputs(self, self.settings.node, frames, self._statistics, self._stamps)
+        self._worker = Worker(frames, self._recognition.work, self._failed)
+        self._worker.start()
+        topics = "\n".join(f"  listens to   {self._inputs.describe(t)}" for t in self.settings.node.image_topics)
+        self.get_logger().info(f"active\n{topics}\n  publishes    {self.resolve_topic_name('loop_closures')}")
+        return SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._stop()
+        self.get_logger().info("inactive; the map is kept")
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._autosave()
+        self._free()
+        self.get_logger().info("cleaned up; the map is freed")
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.stop()
+        return SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._stop()
+        self._free()
+        return SUCCESS
+
+    def stop(self) -> None:
+        """Finish the frame in hand, save if asked to, free everything. May be called twice."""
+        self._stop()
+        self._autosave()
+        self._free()
+
+    def report_failure(self, failure: BaseException) -> None:
+        """The last word on /diagnostics."""
+        if self._diagnostics is not None:
+            self._diagnostics.publish(b"\x02", f"ended by {type(failure).__name__}: {failure}")
+
+    # Services
+
+    def save(self) -> str:
+        raise PnvError("maps cannot be saved yet")
+
+    def load(self) -> str:
+        raise PnvError("maps cannot be loaded yet")
+
+    def reset(self) -> str:
+        if self._recognition is None:
+            raise PnvError(NOT_CONFIGURED)
+        count = self._recognition.reset()
+        return f"forgot {count} keyframes"
+
+    def pause(self, on: bool) -> str:
+        if self._inputs is None:
+            raise PnvError("the node is not active; allowed: activate it first")
+        self._inputs.paused = on
+        return "paused: images are dropped, the map is kept" if on else "running"
+
+    # Parts
+
+    def _configure(self) -> None:
+        config, start = self.settings.node, time.monotonic()
+        views = self._views()
+        describer = describer_from(self.settings.recogniser)
+        recognizer = PlaceRecognizer(self.settings.recogniser, describer, timer=StageTimer(time.perf_counter))
+        first = _warm_up(describer)
+        self._stamps = StampRule(config.on_stamp_back)
+        outputs = Outputs(self, config, describer.image_size)
+        self._recognition = Recognition(
+            recognizer, views, outputs, Thumbnails(config.thumbnails_mb), self._statistics, self.get_logger()
+        )
+        self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
+        self._infos = [
+            self.create_subscription(CameraInfo, topic, self._rectify(views[camera], camera), 1)
+            for topic, camera in zip(config.camera_info_topics, config.image_topics, strict=False)
+        ]
+        per_keyframe = recognizer.database.bytes_per_keyframe(first)
+        self.get_logger().info(
+            self._summary(describer, per_keyframe) + f"\n  configured   in {time.monotonic() - start:.1f} s"
+        )
+
+    def _summary(self, describer: Describer, per_keyframe: int) -> str:
+        config, info = describer.config, describer.model.info
+        budget = config.memory_budget_mb * 1e6
+        return "\n".join(
+            [
+                "place recogniser",
+                f"  model        {config.weights} ({info.trunk}, K = {describer.model.netvlad.centroids.shape[0]}, "
+                f"D = {describer.model.global_dim}, {describer.fingerprint[:12]})",
+                f"  device       {describer.device}, {config.threads or 'all'} threads",
+                f"  preset       {config.preset}: {config.image_width}x{config.image_height} px, patches "
+                f"{', '.join(map(str, config.patch_sizes))}, {config.scorer}, accepted from {config.accept_score:g}",
+                f"  memory       {per_keyframe / 1e6:.3f} MB per keyframe, {config.memory_budget_mb:g} MB for "
+                f"{int(budget // per_keyframe)} keyframes",
+            ]
+        )
+
+    def _views(self) -> dict[str, View]:
+        config = self.settings.node
+        masks: list[NDArray[np.uint8] | None] = [read_mask(path) for path in config.masks]
+        if len(masks) < 2:
+            masks = (masks or [None]) * len(config.image_topics)
+        views = {t: View(m, config.crop) for t, m in zip(config.image_topics, masks, strict=True)}
+        for view in views.values():
+            view.needs_info = bool(config.camera_info_topics)
+        return views
+
+    def _rectify(self, view: View, camera: str) -> Callable[[CameraInfo], None]:
+        def receive(info: CameraInfo) -> None:
+            try:
+                if view.rectifier is None or view.rectifier.size != (info.width, info.height):
+                    view.rectifier = Rectifier(info)
+                    self.get_logger().info(f"images of {camera} are rectified as {info.width}x{info.height}")
+            except ImageError as error:
+                self.get_logger().warning(f"camera info of {camera}: {error}", throttle_duration_sec=10.0)
+
+        return receive
+
+    def _settings_changed(self, settings: Settings) -> None:
+        if self._recognition is not None:
+            self._recognition.change(settings)
+
+    def _every_second(self) -> None:
+        recognition, inputs, diagnostics = self._recognition, self._inputs, self._diagnostics
+        if recognition is None or inputs is None or diagnostics is None:
+            return
+        inputs.follow_types()
+        diagnostics.look(self.settings, inputs)
+        recognition.outputs.markers.publish(recognition.recognizer.database.refs(), self.settings.node)
+
+    def _stop(self) -> None:
+        if self._inputs is not None:
+            self._inputs.close()
+            self._inputs = None
+        if self._worker is not None:
+            self._worker.stop()
+            self._worker = None
+
+    def _autosave(self) -> None:
+        if self._recognition is not None and self.settings.node.autosave:
+            try:
+                self.get_logger().info(self.save())
+            except (PnvError, OSError, MemoryError) as error:
+                self.get_logger().error(f"the map is not saved: {error}")
+
+    def _free(self) -> None:
+        if self._recognition is not None:
+            self._recognition.outputs.close()
+            for subscription in self._infos:
+                self.destroy_subscription(subscription)
+        if self._diagnostics is not None:
+            self._diagnostics.close()
+        self._recognition = self._diagnostics = None
+
+    def _changing_state(self, change: Callable[..., Any]) -> Callable[..., Any]:
+        """A transition that the present state does not allow is answered with false, where rclpy raises."""
+
+        def answer(request: Any, response: Any) -> Any:
+            try:
+                return change(request, response)
+            except rclpy_implementation.RCLError as error:
+                self.get_logger().error(f"no such transition from here: {error}")
+                response.success = False
+                return response
+
+        return answer
+
+
+def _warm_up(describer: Describer) -> PlaceDescriptor:
+    """Describe noise, so that the first real frame takes no longer than the others."""
+    width, height = describer.image_size
+    return describer.describe(np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8))

@@ -1,0 +1,80 @@
+"""NodeConfig: every setting of the node that is none of the recogniser, declared once."""
+
+from dataclasses import dataclass
+
+from pnv_core.errors import ConfigError
+from pnv_core.settings import checked, setting
+
+
+@dataclass(frozen=True)
+class NodeConfig:
+    """Settings of the node; every instance is valid or raises ConfigError."""
+
+    # Inputs
+    image_topics: tuple[str, ...] = setting(
+        ("camera/image_raw",), "image topics, one per camera; closures name a camera by its index in this list"
+    )
+    transport: str = setting(
+        "auto",
+        "message type of the image topics: raw = Image, compressed = CompressedImage, auto = as published",
+        choices=("auto", "raw", "compressed"),
+    )
+    masks: tuple[str, ...] = setting(
+        (), "image files, one per camera or one for all; black pixels are ignored (the robot's own body)", kind=str
+    )
+    crop: tuple[int, ...] = setting(
+        (), "pixels cut off at left, top, right, bottom before anything else is done", kind=int, unit="px", low=0
+    )
+    camera_info_topics: tuple[str, ...] = setting(
+        (), "CameraInfo topics, one per camera; images are then rectified before use", kind=str
+    )
+    odometry_topic: str = setting("", "nav_msgs/Odometry that places keyframes in ~/markers")
+    pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
+
+    # Time
+    on_stamp_back: str = setting(
+        "skip",
+        "frames whose stamp goes back by 1 s or more (a bag in a loop): skip them, or begin a new session",
+        choices=("skip", "new_session"),
+    )
+    no_image_warning_s: float = setting(5.0, "warn when no image came for so long", unit="s", low=0.1, live=True)
+
+    # Life
+    autostart: bool = setting(True, "configure and activate at start; false leaves that to a life-cycle manager")
+    map_path: str = setting("", "file that ~/save writes and ~/load reads", live=True)
+    load_on_start: bool = setting(False, "load map_path when configuring")
+    autosave: bool = setting(False, "save to map_path at shutdown and clean-up", live=True)
+    read_only: bool = setting(False, "localise in the loaded map: nothing is added to it")
+
+    # Outputs
+    publish_candidates: bool = setting(True, "publish ~/candidates while somebody subscribes", live=True)
+    publish_markers: bool = setting(True, "publish ~/markers while somebody subscribes", live=True)
+    publish_match_image: bool = setting(True, "publish ~/match_image while somebody subscribes", live=True)
+    publish_lio_sam: bool = setting(True, "publish ~/lio_sam", live=True)
+    lio_sam_interval_s: float = setting(
+        1.0, "least time between the queries of ~/lio_sam", unit="s", low=0.0, live=True
+    )
+    lio_sam_gap_s: float = setting(
+        30.0, "least time between query and match of ~/lio_sam", unit="s", low=0.0, live=True
+    )
+    frame_id: str = setting("map", "frame of ~/markers where poses name none", live=True)
+    thumbnails_mb: float = setting(
+        32.0, "memory for small keyframe pictures, shown in ~/match_image; 0 = none", unit="MB", low=0.0
+    )
+
+    def __post_init__(self) -> None:
+        checked(self)
+        topics = self.image_topics
+        if not topics or "" in topics or len(set(topics)) != len(topics):
+            raise ConfigError(f"image_topics = {list(topics)}; allowed: one or more different topic names")
+        if len(self.crop) not in (0, 4):
+            raise ConfigError(f"crop = {list(self.crop)} has {len(self.crop)} entries; allowed: 0 or 4")
+        if len(self.masks) not in (0, 1, len(topics)):
+            raise ConfigError(f"masks has {len(self.masks)} entries; allowed: 0, 1 or one per image topic")
+        if len(self.camera_info_topics) not in (0, len(topics)):
+            raise ConfigError(
+                f"camera_info_topics has {len(self.camera_info_topics)} entries; allowed: 0 or one per image topic"
+            )
+        for name in ("load_on_start", "autosave", "read_only"):
+            if getattr(self, name) and not self.map_path:
+                raise ConfigError(f"{name} is true but map_path is empty; allowed: a file")

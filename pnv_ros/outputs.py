@@ -1,0 +1,88 @@
+"""What the node publishes of each query, and when."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
+from std_msgs.msg import Float64MultiArray
+
+from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam, closures_to_message
+from msg_adapters.pictures import rgb_to_message
+from pnv_core.drawing import draw_match
+from pnv_core.types import Frame, LoopClosure, Reason
+from pnv_ros.markers import Markers
+from pnv_ros.node_config import NodeConfig
+from pnv_ros.thumbnails import Thumbnails
+
+CLOSURES_QOS = QoSProfile(
+    depth=50, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
+TABLE_QOS = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
+PICTURE_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE)
+
+REASONS = tuple(str(reason) for reason in Reason)  # the wire codes of ~/candidates
+
+
+class Outputs:
+    """The publishers of a configured node. `config` may be replaced between frames."""
+
+    def __init__(self, node: Node, config: NodeConfig, picture_size: tuple[int, int]) -> None:
+        self.markers = Markers(node, config)
+        self._node, self.config, self._size = node, config, picture_size
+        self._cameras = config.image_topics
+        self._closures = node.create_publisher(Float64MultiArray, "loop_closures", CLOSURES_QOS)
+        self._lio_sam = node.create_publisher(Float64MultiArray, "~/lio_sam", TABLE_QOS)
+        self._candidates = node.create_publisher(PointCloud2, "~/candidates", TABLE_QOS)
+        self._match_image = node.create_publisher(Image, "~/match_image", PICTURE_QOS)
+        self._last_lio_sam_ns: int | None = None
+
+    def close(self) -> None:
+        for publisher in (self._closures, self._lio_sam, self._candidates, self._match_image):
+            self._node.destroy_publisher(publisher)
+        self.markers.close()
+
+    def new_session(self) -> None:
+        self._last_lio_sam_ns = None
+
+    def publish(self, frame: Frame, closures: Sequence[LoopClosure], thumbnails: Thumbnails) -> None:
+        """Everything there is to say about one query; `closures` best first, refused ones too, not empty."""
+        accepted = [c for c in closures if c.accepted]
+        if accepted:
+            self._closures.publish(closures_to_message(accepted, self._cameras))
+            self._publish_lio_sam(accepted)
+            self.markers.add(accepted)
+        if self.config.publish_candidates and self._candidates.get_subscription_count():
+            self._candidates.publish(
+                candidates_to_message(closures, self._cameras, REASONS, self.config.frame_id)
+            )
+        if self.config.publish_match_image and self._match_image.get_subscription_count():
+            self._match_image.publish(self._picture(frame, closures[0], thumbnails))
+
+    def _publish_lio_sam(self, accepted: Sequence[LoopClosure]) -> None:
+        """The best closure old enough for LIO-SAM, which takes no loops within its own window."""
+        if not self.config.publish_lio_sam:
+            return
+        gap_ns, interval_ns = self.config.lio_sam_gap_s * 1e9, self.config.lio_sam_interval_s * 1e9
+        best = next((c for c in accepted if c.query.stamp_ns - c.match.stamp_ns >= gap_ns), None)
+        if best is None:
+            return
+        last = self._last_lio_sam_ns
+        if last is None or best.query.stamp_ns - last >= interval_ns:
+            self._lio_sam.publish(closure_to_lio_sam(best))
+            self._last_lio_sam_ns = best.query.stamp_ns
+
+    def _picture(self, frame: Frame, closure: LoopClosure, thumbnails: Thumbnails) -> Image:
+        reference = thumbnails.get(closure.match.id)
+        if reference is None:
+            reference = _blank(self._size)
+        verdict = "accepted" if closure.accepted else f"refused: {closure.reason}"
+        caption = f"score {closure.score:.3f}, {verdict}"
+        picture = draw_match(frame.rgb, reference, closure.matches, self._size, caption)
+        return rgb_to_message(picture, frame.stamp_ns, self.config.frame_id)
+
+
+def _blank(size: tuple[int, int]) -> NDArray[np.uint8]:
+    return np.full((size[1], size[0], 3), 64, np.uint8)

@@ -1,0 +1,119 @@
+"""The worker's task: one waiting frame through the recogniser."""
+
+import threading
+import time
+from contextlib import AbstractContextManager
+from typing import Any
+
+from rclpy.serialization import deserialize_message
+
+from msg_adapters.images import message_to_frame
+from pnv_core.errors import ImageError
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.types import Frame, LoopClosure
+from pnv_ros.outputs import Outputs
+from pnv_ros.parameters import Settings
+from pnv_ros.slot import WaitingFrame
+from pnv_ros.statistics import Drop, Statistics
+from pnv_ros.thumbnails import Thumbnails
+from pnv_ros.view import View
+
+_REPEAT_S = 10.0  # the same complaint is not made more often
+
+
+class Recognition:
+    """Recogniser, views and outputs of a configured node. Between two frames, services may hold it `still`."""
+
+    def __init__(
+        self,
+        recognizer: PlaceRecognizer,
+        views: dict[str, View],
+        outputs: Outputs,
+        thumbnails: Thumbnails,
+        statistics: Statistics,
+        log: Any,
+    ) -> None:
+        self.recognizer, self.views, self.outputs = recognizer, views, outputs
+        self.thumbnails, self._statistics, self._log = thumbnails, statistics, log
+        self._session = 0
+        self._still = threading.Lock()
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self._complained: dict[str, float] = {}
+
+    def still(self) -> AbstractContextManager[Any]:
+        """No frame is processed while this is held."""
+        return self._still
+
+    def change(self, settings: Settings) -> None:
+        """New live settings, all at once, from the next frame on."""
+        with self._still:
+            self.recognizer.change(settings.recogniser)
+            self.outputs.config = settings.node
+
+    def reset(self) -> int:
+        """Forget every keyframe; how many there were."""
+        with self._still:
+            count = len(self.recognizer.database)
+            self.recognizer.reset()
+            self.thumbnails.clear()
+            return count
+
+    def work(self, waiting: WaitingFrame) -> None:
+        """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""
+        with self._still:
+            if waiting.session != self._session:
+                self._session = waiting.session
+                self.recognizer.new_session()
+                self.outputs.new_session()
+            view = self.views[waiting.camera]
+            if view.needs_info and view.rectifier is None:
+                self._statistics.drop(Drop.NO_CAMERA_INFO)
+                self._complain(f"{waiting.camera} info", f"frames of {waiting.camera} wait for its camera info")
+                return
+            try:
+                frame = self._unpacked(waiting)
+                newest = self.recognizer.database.last()
+                closures = self.recognizer.process(frame)
+            except ImageError as error:
+                count = self._statistics.drop(Drop.UNUSABLE)
+                self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
+                return
+            added = self.recognizer.database.last()
+            if added is not None and added != newest:
+                self.thumbnails.add(added.id, frame.rgb)
+            if closures:
+                with self.recognizer.timer.stage("publish"):
+                    self.outputs.publish(frame, closures, self.thumbnails)
+        accepted = sum(c.accepted for c in closures)
+        self._statistics.process(closures[0].score if closures else None, accepted, _in_words(closures))
+
+    def _unpacked(self, waiting: WaitingFrame) -> Frame:
+        with self.recognizer.timer.stage("decode"):
+            message = deserialize_message(waiting.serialized, waiting.message_type)
+            frame = message_to_frame(message, waiting.camera)
+            size = frame.rgb.shape[1], frame.rgb.shape[0]
+            known = self._sizes.setdefault(waiting.camera, size)
+            if size != known:
+                self._sizes[waiting.camera] = size
+                self._complain(
+                    f"{waiting.camera} size",
+                    f"images of {waiting.camera} changed from {known[0]}x{known[1]} to {size[0]}x{size[1]}; "
+                    "both are resized to the model's input, but one topic should carry one camera",
+                )
+            return self.views[waiting.camera](frame)
+
+    def _complain(self, about: str, text: str) -> None:
+        now = time.monotonic()
+        if now - self._complained.get(about, -_REPEAT_S) >= _REPEAT_S:
+            self._complained[about] = now
+            self._log.warning(text)
+
+
+def _in_words(closures: list[LoopClosure]) -> str:
+    if not closures:
+        return ""
+    best = closures[0]
+    return (
+        f"{best.query.stamp_ns / 1e9:.3f} s ({best.query.camera}) matches {best.match.stamp_ns / 1e9:.3f} s "
+        f"({best.match.camera}), score {best.score:.3f}"
+    )

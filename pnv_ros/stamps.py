@@ -1,0 +1,47 @@
+"""What happens to header stamps that repeat or go back, as in a bag played in a loop."""
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+
+class StampVerdict(Enum):
+    """What becomes of a frame by its stamp."""
+
+    USE = auto()
+    REPEATED = auto()  # skipped
+    BACK = auto()  # skipped
+    NEW_SESSION = auto()  # used; everything before it belongs to an earlier session
+
+
+@dataclass(frozen=True)
+class Ruling:
+    verdict: StampVerdict
+    session: int
+    back_ns: int = 0  # how far the stamp lies behind the camera's last one
+
+
+class StampRule:
+    """Stamps of one camera must rise. One that repeats is skipped always, one that goes back by `on_stamp_back`.
+
+    A step back of less than REORDERED_NS is a late frame, not a new run, and is skipped either way.
+    """
+
+    REORDERED_NS = 1_000_000_000
+
+    def __init__(self, on_stamp_back: str) -> None:
+        self._new_session = on_stamp_back == "new_session"
+        self._last: dict[str, int] = {}
+        self.session = 0
+
+    def judge(self, camera: str, stamp_ns: int) -> Ruling:
+        last = self._last.get(camera)
+        if last is None or stamp_ns > last:
+            self._last[camera] = stamp_ns
+            return Ruling(StampVerdict.USE, self.session)
+        if stamp_ns == last:
+            return Ruling(StampVerdict.REPEATED, self.session)
+        if not self._new_session or last - stamp_ns < self.REORDERED_NS:
+            return Ruling(StampVerdict.BACK, self.session, last - stamp_ns)
+        self.session += 1
+        self._last = {camera: stamp_ns}
+        return Ruling(StampVerdict.NEW_SESSION, self.session, last - stamp_ns)
