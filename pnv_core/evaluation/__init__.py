@@ -1,0 +1,1 @@
+"""Measuring place recognition: data sets with their ground truth, methods, metrics, tables and the report."""
