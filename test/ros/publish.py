@@ -1,0 +1,82 @@
+"""A camera: publishes images from files or noise with given stamps, as a process of its own.
+
+python -m test.ros.publish --topic camera/image_raw --stamps STAMPS.csv --rate 10
+The CSV has one row per image: nanoseconds, path (empty: seeded noise).
+"""
+
+import argparse
+import csv
+import sys
+import time
+from array import array
+
+import cv2
+import numpy as np
+import rclpy
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import CompressedImage, Image
+
+ENCODINGS = {
+    "bgr8": lambda bgr: bgr,
+    "rgb8": lambda bgr: cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB),
+    "mono8": lambda bgr: cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY),
+    "rgba8": lambda bgr: cv2.cvtColor(bgr, cv2.COLOR_BGR2RGBA),
+    "mono16": lambda bgr: cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY).astype("<u2") * 257,
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--topic", default="camera/image_raw")
+    parser.add_argument("--stamps", required=True)
+    parser.add_argument("--rate", type=float, default=10.0)
+    parser.add_argument("--encoding", default="bgr8")  # of ENCODINGS, or jpeg, png
+    parser.add_argument("--reliable", action="store_true")
+    parser.add_argument("--size", default="320x240")  # of noise
+    parser.add_argument("--linger", type=float, default=1.0)
+    args = parser.parse_args()
+
+    compressed = args.encoding in ("jpeg", "png")
+    rclpy.init()
+    node = rclpy.create_node("camera_driver")
+    reliability = QoSReliabilityPolicy.RELIABLE if args.reliable else QoSReliabilityPolicy.BEST_EFFORT
+    kind = CompressedImage if compressed else Image
+    publisher = node.create_publisher(kind, args.topic, QoSProfile(depth=5, reliability=reliability))
+    give_up = time.monotonic() + 30
+    while not publisher.get_subscription_count():
+        if time.monotonic() > give_up:
+            print("nobody listens", file=sys.stderr)
+            return 1
+        time.sleep(0.02)
+    time.sleep(0.3)  # the other side may know of this one a little later
+
+    width, height = (int(v) for v in args.size.split("x"))
+    with open(args.stamps, newline="") as file:
+        rows = [(int(stamp), path) for stamp, path in csv.reader(file)]
+    due = time.monotonic()
+    for number, (stamp_ns, path) in enumerate(rows):
+        if path:
+            bgr = cv2.imread(path)
+        else:
+            bgr = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
+        message = kind()
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        if compressed:
+            message.format = args.encoding
+            message.data = array("B", cv2.imencode("." + args.encoding, bgr)[1].tobytes())
+        else:
+            pixels = ENCODINGS[args.encoding](bgr)
+            message.encoding = args.encoding
+            message.height, message.width = pixels.shape[:2]
+            message.step = pixels[0].nbytes
+            message.data = array("B", pixels.tobytes())
+        publisher.publish(message)
+        due += 1.0 / args.rate
+        time.sleep(max(0.0, due - time.monotonic()))
+    time.sleep(args.linger)
+    print(f"published {len(rows)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

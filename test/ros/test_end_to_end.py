@@ -1,0 +1,93 @@
+"""Real frames through the installed executable, the real algorithm and the real middleware."""
+
+import csv
+import signal
+from pathlib import Path
+
+import pytest
+from sensor_msgs.msg import PointCloud2
+from std_msgs.msg import Float64MultiArray
+
+from msg_adapters.loop_closures import closures_from_message
+from pnv_ros.outputs import CLOSURES_QOS
+from test.ros.processes import publisher, running_node, wait_until
+from test.ros.tables import rows_of
+
+pytestmark = pytest.mark.process
+EPOCH_S = 1_700_000_000
+
+
+def nanoseconds(seconds: str) -> int:
+    """Decimal text to the nanosecond, without rounding through a float."""
+    whole, _, fraction = seconds.partition(".")
+    return (EPOCH_S + int(whole)) * 10**9 + int((fraction + "0" * 9)[:9])
+
+
+def write_stamps(path: Path, rows: list[tuple[int, Path]]) -> str:
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    return str(path)
+
+
+def test_closures_of_a_robot_driving_laps_arrive_with_the_stamps_of_its_images(shared, tmp_path, listener):
+    folder = shared / "data" / "donkey_desks_laps"
+    with (folder / "frames.csv").open() as file:
+        stamps = {row["frame"]: nanoseconds(row["timestamp"]) for row in csv.DictReader(file)}
+    with (folder / "matches.csv").open() as file:
+        truth = {row["query"]: set(row["true_refs"].split(";")) for row in csv.DictReader(file)}
+    names = [f"{number:05d}.jpg" for first, last in ((20, 80), (346, 380)) for number in range(first, last, 2)]
+    table = write_stamps(tmp_path / "stamps.csv", [(stamps[n], folder / "images" / n) for n in names])
+    by_stamp = {stamps[n]: n for n in names}
+
+    arrived = listener.collect(Float64MultiArray, "/loop_closures", CLOSURES_QOS)
+    with running_node(exclude_recent_s=10, min_interval_s=0.0, min_change=0.0, accept_score=0.0,
+                      consistency=0) as node:  # fmt: skip
+        assert publisher("--stamps", table, "--rate", "4").wait() == 0
+        wait_until(lambda: len(arrived) >= 8, 10, "closures")
+        assert node.end(signal.SIGINT) == 0
+        assert "Traceback" not in node.output
+
+    right = 0
+    for message in arrived:
+        closures = closures_from_message(message)
+        assert [c.score for c in closures] == sorted((c.score for c in closures), reverse=True)
+        for closure in closures:
+            assert closure.query.stamp_ns in by_stamp
+            assert closure.match.stamp_ns in by_stamp
+            assert closure.query.stamp_ns - closure.match.stamp_ns >= 10e9
+            assert (closure.query.camera, closure.match.camera) == ("0", "0")
+        best = closures[0]
+        right += by_stamp[best.match.stamp_ns] in truth[by_stamp[best.query.stamp_ns]]
+    assert right >= 0.7 * len(arrived)
+
+
+def test_the_end_of_a_campus_loop_is_recognised_as_its_beginning(shared, tmp_path, listener):
+    folder = shared / "data" / "ikuta_campus_loop" / "images"
+    images = sorted(folder.iterdir())
+    shown = images[:6] + images[30:36] + images[-2:]
+    stamps = {(EPOCH_S + 10 * i) * 10**9 + 999_999_999 - i: path.name for i, path in enumerate(shown)}
+    table = write_stamps(tmp_path / "stamps.csv", list(zip(stamps, shown, strict=True)))
+
+    tables = listener.collect(PointCloud2, "/place_recognizer/candidates")
+    with running_node(min_change=0.0) as node:
+        assert publisher("--stamps", table, "--rate", "2", "--encoding", "png").wait() == 0
+        wait_until(lambda: tables and rows_of(tables[-1])[0]["query_sec"] == max(stamps) // 10**9, 10, "the last frame")
+        assert node.end(signal.SIGTERM) == 0
+    last = rows_of(tables[-1])
+    assert (last[0]["query_sec"], last[0]["query_nsec"]) == divmod(max(stamps), 10**9)
+    assert stamps[last[0]["match_sec"] * 10**9 + last[0]["match_nsec"]] in ("000.png", "001.png", "002.png")
+
+
+def test_a_grey_compressed_and_a_16_bit_camera_give_closures_alike(shared, tmp_path, listener):
+    images = sorted((shared / "data" / "tiny" / "slambook2_ch11").iterdir())[:10]
+    table = write_stamps(tmp_path / "stamps.csv",
+                         [((EPOCH_S + 40 * i) * 10**9 + i, p) for i, p in enumerate(images)])  # fmt: skip
+    best = {}
+    for encoding in ("mono8", "mono16", "png"):
+        tables = listener.collect(PointCloud2, "/place_recognizer/candidates")
+        with running_node(min_change=0.0) as node:
+            assert publisher("--stamps", table, "--rate", "4", "--encoding", encoding).wait() == 0
+            wait_until(lambda found=tables: found and rows_of(found[-1])[0]["query_nsec"] == 9, 10, "the last frame")
+            assert node.end() == 0
+        best[encoding] = rows_of(tables[-1])[0]["match_nsec"]
+    assert best == {"mono8": 0, "mono16": 0, "png": 0}  # images 1 and 10 show the same place
