@@ -42,16 +42,16 @@ class Heard:
         return self.count("frames in") <= self.count("frames processed") + self.dropped
 
 
-def listen(node: Node, on_closure: Callable[[LoopClosure], None]) -> Heard:
-    """Subscribe a node to everything; `on_closure` is called for each closure as it arrives."""
+def listen(node: Node, on_closures: Callable[[list[LoopClosure]], None]) -> Heard:
+    """Subscribe a node to everything; `on_closures` is called with the closures of each query as they arrive."""
     heard = Heard()
 
     def closures(message: Float64MultiArray) -> None:
         now = time.monotonic()
-        for closure in closures_from_message(message):
-            heard.arrived.setdefault(closure.query.stamp_ns, now)
-            heard.closures.append(closure)
-            on_closure(closure)
+        closures_of_query = closures_from_message(message)
+        heard.arrived.setdefault(closures_of_query[0].query.stamp_ns, now)
+        heard.closures += closures_of_query
+        on_closures(closures_of_query)
 
     def candidates(message: PointCloud2) -> None:
         heard.arrived.setdefault(stamp_of(message), time.monotonic())

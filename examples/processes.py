@@ -72,7 +72,10 @@ class Process:
 def node_process(
     environment: dict[str, str], parameters: dict[str, Any], assignments: Sequence[str], echo: IO[str] | None
 ) -> Process:
-    """The installed `place_recognizer` with ROS parameters, and more of them as `name:=value`. Raises PnvError where it is not installed."""
+    """The installed `place_recognizer` with ROS parameters, and more of them as `name:=value`.
+
+    Raises PnvError where it is not installed.
+    """
     beside = Path(sys.executable).parent / "place_recognizer"
     executable = str(beside) if beside.exists() else shutil.which("place_recognizer")
     if executable is None:

@@ -58,7 +58,7 @@ def play(args: argparse.Namespace) -> Run:
         print(f"{args.world}, {len(run.truth)} rendered frames, {args.laps:g} laps; {LIGHT_AND_LINE}", flush=True)
     rclpy.init(args=[])
     listener = rclpy.create_node("demo_listener")
-    run.heard = listen(listener, lambda closure: print(_sentence(closure, run), flush=True))
+    run.heard = listen(listener, lambda closures: print(_sentence(closures, run), flush=True))
     parameters = {"image_topics": [IMAGE_TOPIC], "exclude_recent_s": args.exclude_recent_s}
     log = sys.stderr if args.node_log else None
     try:
@@ -94,11 +94,14 @@ def _follow(listener: rclpy.node.Node, run: Run, node: Process, publisher: Proce
     run.take(publisher.json_lines())
 
 
-def _sentence(closure: LoopClosure, run: Run) -> str:
-    verdict = {True: "right", False: "WRONG", None: ""}[run.right(closure)]
-    query, match = (run.seconds(ref.stamp_ns) for ref in (closure.query, closure.match))
-    sentence = f"  loop closure: {query:7.2f} s is the place of {match:7.2f} s   score {closure.score:.3f}   {verdict}"
-    return sentence.rstrip()
+def _sentence(closures: list[LoopClosure], run: Run) -> str:
+    """The best closure of a query, and how many more it has."""
+    best = closures[0]
+    query, match = (run.seconds(ref.stamp_ns) for ref in (best.query, best.match))
+    verdict = {True: "right", False: "WRONG", None: ""}[run.right(best)]
+    more = f"and {len(closures) - 1} more" if len(closures) > 1 else ""
+    words = f"loop closure: {query:7.2f} s is the place of {match:7.2f} s", f"score {best.score:.3f}", verdict, more
+    return "  " + "   ".join(word for word in words if word)
 
 
 def report(args: argparse.Namespace, run: Run) -> int:
