@@ -44,7 +44,7 @@ class StoredKeyframe:
     vector: NDArray[np.float32]  # (D,), a row of the vector table, valid while `row` lives
     row: Row
     layouts: tuple[GridLayout, ...]
-    buffer: NDArray[np.uint8] | DiskBuffer
+    buffer: NDArray[np.uint8] | DiskBuffer  # the patches, then the thumbnail
     texture: float
 
     def read(self) -> NDArray[np.uint8]:
@@ -55,7 +55,10 @@ class StoredKeyframe:
         return views(self.read(), self.layouts)
 
     def descriptor(self) -> PlaceDescriptor:
-        return PlaceDescriptor(self.vector.copy(), tuple(codes.grid() for codes in self.patches()), self.texture)
+        buffer = self.read()
+        patches = tuple(codes.grid() for codes in views(buffer, self.layouts))
+        thumbnail = buffer[buffer_bytes(self.layouts) :].tobytes()
+        return PlaceDescriptor(self.vector.copy(), patches, self.texture, thumbnail)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +88,8 @@ class DatabaseStats:
         return self.bytes_budget - self.bytes_used
 
 
-class Restorable(Protocol):
-    """A keyframe as a saved map gives it."""
+class KeyframeRecord(Protocol):
+    """A keyframe that can be saved or restored: one of the database, or one read from a map."""
 
     @property
     def ref(self) -> ImageRef: ...
@@ -200,7 +203,8 @@ class KeyframeDatabase:
 
     def bytes_per_keyframe(self, descriptor: PlaceDescriptor) -> int:
         """Bytes this keyframe would take, known before it is added."""
-        return self._table.row_bytes + OBJECT_BYTES + buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
+        patches = buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
+        return self._table.row_bytes + OBJECT_BYTES + patches + len(descriptor.thumbnail)
 
     def stats(self) -> DatabaseStats:
         with self._lock:
@@ -223,6 +227,9 @@ class KeyframeDatabase:
         vector = _unit_vector(descriptor.global_vector, self.dim)
         layouts = self._shared(layout_of(descriptor.patches, self.patch_precision))
         buffer = encode(descriptor.patches, layouts)
+        if descriptor.thumbnail:
+            buffer = np.concatenate([buffer, np.frombuffer(descriptor.thumbnail, np.uint8)])
+            buffer.flags.writeable = False
         with self._lock:
             self._make_room(len(buffer))
             ref = ImageRef(self._next_id, stamp_ns, camera, self._session)
@@ -252,7 +259,7 @@ class KeyframeDatabase:
         keyframe = next(iter(self._in_memory))
         stored = self._keyframes[keyframe]
         try:
-            place = self._patch_file.write(stored.buffer)
+            place = self._patch_file.write(stored.read())
         except OSError as error:
             if not self._disk_failed:
                 _log.warning("patches stay in memory: %s: %s", self._patch_file.folder, error.strerror)
@@ -287,7 +294,7 @@ class KeyframeDatabase:
         stored = self._keyframes.pop(keyframe)
         del self._ids[bisect_left(self._ids, keyframe)]
         if keyframe in self._in_memory:
-            self._patch_bytes -= len(stored.buffer)
+            self._patch_bytes -= stored.buffer.nbytes
             del self._in_memory[keyframe]
         self._index.remove(stored.row.slot)
         self._eviction.removed(stored.ref)
@@ -379,7 +386,7 @@ class KeyframeDatabase:
             keyframes = [self._keyframes[i] for i in self._ids]
             return Snapshot(self._lineage, self.dim, self._next_id, self._session + 1, keyframes)
 
-    def restore(self, keyframes: Iterable["Restorable"], next_id: int, next_session: int) -> object:
+    def restore(self, keyframes: Iterable[KeyframeRecord], next_id: int, next_session: int) -> object:
         """Replace the contents by keyframes of a saved map, by ascending id, and begin a new session.
 
         Gives the lineage of later snapshots. Raises PnvError, leaving the database empty, when they exceed the budget.
@@ -395,7 +402,7 @@ class KeyframeDatabase:
             self._next_id, self._session = next_id, next_session
             return self._lineage
 
-    def _take_back(self, kf: "Restorable") -> None:
+    def _take_back(self, kf: KeyframeRecord) -> None:
         buffer = np.frombuffer(kf.read(), np.uint8)
         while self._bytes_with(1) + len(buffer) > self.bytes_budget:
             if not self._spill():

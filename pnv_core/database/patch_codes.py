@@ -4,6 +4,7 @@ P = patches of one size, D = descriptor dimension. An int8 row is its float row 
 (max |x| / 127), so that the product of two rows is (int8 . int8) * scale * scale.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,8 +60,7 @@ class PatchCodes:
 
 def layout_of(grids: tuple[PatchGrid, ...], precision: str) -> tuple[GridLayout, ...]:
     """The buffer layout of these grids in this precision. Raises ValueError for a grid of the wrong shape."""
-    layouts = []
-    at = 0
+    shapes = []
     for grid in grids:
         patches, dim = grid.descriptors.shape
         if patches != grid.rows * grid.cols:
@@ -68,15 +68,22 @@ def layout_of(grids: tuple[PatchGrid, ...], precision: str) -> tuple[GridLayout,
                 f"patch grid {grid.rows} x {grid.cols} of size {grid.size} has {patches} descriptors; "
                 f"allowed: {grid.rows * grid.cols}"
             )
+        shapes.append((grid.size, grid.rows, grid.cols, grid.stride, dim))
+    return layout_of_shapes(shapes, precision)
+
+
+def layout_of_shapes(shapes: Iterable[tuple[int, int, int, int, int]], precision: str) -> tuple[GridLayout, ...]:
+    """The buffer layout of grids given as (size, rows, cols, stride, D)."""
+    layouts = []
+    at = 0
+    for size, rows, cols, stride, dim in shapes:
         codes_at = at
-        at += _padded(patches * dim * DTYPES[precision].itemsize)
+        at += _padded(rows * cols * dim * DTYPES[precision].itemsize)
         scales_at = -1
         if precision == "int8":
             scales_at = at
-            at += _padded(patches * 4)
-        layouts.append(
-            GridLayout(grid.size, grid.rows, grid.cols, grid.stride, dim, precision, codes_at, scales_at, end=at)
-        )
+            at += _padded(rows * cols * 4)
+        layouts.append(GridLayout(size, rows, cols, stride, dim, precision, codes_at, scales_at, end=at))
     return tuple(layouts)
 
 

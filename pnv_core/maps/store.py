@@ -1,0 +1,294 @@
+"""MapStore: a map on disk that a running recogniser saves into and loads from.
+
+A map is a folder: segments of keyframes that are written once, and a manifest that names those which make up the map.
+A save writes only what is not on disk yet, then replaces the manifest. Until that moment the map is the one before;
+from it on, the new one. Files that no manifest names are leftovers and are removed by the next save.
+"""
+
+import fcntl
+import os
+import re
+from bisect import bisect
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pnv_core.database import KeyframeDatabase, Snapshot
+from pnv_core.database.keyframes import KeyframeRecord
+from pnv_core.errors import MapError
+from pnv_core.maps.manifest import (
+    NAME,
+    Manifest,
+    Runs,
+    Segment,
+    Session,
+    ids_of,
+    read_manifest,
+    runs_of,
+    write_manifest,
+)
+from pnv_core.maps.segment import SavedKeyframe, SegmentHeader, SegmentWriter, read_segment
+from pnv_core.types import ImageRef
+
+SEGMENT_BYTES = 64_000_000  # a segment is closed beyond this, so that a rolling map frees disk in small steps
+_SMALL_BYTES, _MANY_SMALL = 8_000_000, 16  # so many segments smaller than this are written anew as one
+_LOCK = "lock"
+_OURS = re.compile(r"segment-\d{8}-\d{4}\.pnv|" + re.escape(NAME) + r"(\.new)?|" + _LOCK)
+
+
+@dataclass(frozen=True)
+class SaveReport:
+    """What a save did."""
+
+    path: Path
+    keyframes: int
+    written: int  # keyframes written anew
+    bytes_written: int
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.keyframes} keyframes, {self.written} new ({self.bytes_written / 1e6:.1f} MB)"
+
+
+class MapStore:
+    """A map folder bound to a model's fingerprint.
+
+    `save` may run in any one thread while frames go on; it writes the difference to what it loaded or saved before.
+    A map on disk that this store has neither loaded nor saved is not overwritten unless `replace`.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], fingerprint: str, *, replace: bool = False) -> None:
+        self.path = Path(path)
+        self.fingerprint = fingerprint
+        self._replace = replace
+        self._known: Manifest | None = None  # what is on disk, as far as this store knows
+        self._lineage: object = None  # of the snapshot that `_known` holds
+
+    def exists(self) -> bool:
+        """Whether a save was completed there."""
+        return (self.path / NAME).exists()
+
+    def load(self, database: KeyframeDatabase) -> Manifest:
+        """Verify the whole map, then replace the database's contents by it and begin a new session.
+
+        Raises MapError for a map that is damaged or of another model, PnvError for one beyond the memory budget.
+        """
+        manifest = read_manifest(self.path)
+        if manifest.fingerprint != self.fingerprint:
+            raise MapError(
+                f"{self.path} was made with model {manifest.fingerprint}; this is model {self.fingerprint}; "
+                "allowed: a map of the same model"
+            )
+        if manifest.dim != database.dim:
+            raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")
+        for _ in keyframes_of(self.path, manifest):
+            pass
+        keyframes = keyframes_of(self.path, manifest)
+        self._lineage = database.restore(keyframes, manifest.next_id, manifest.next_session)
+        self._known = manifest
+        return manifest
+
+    def save(self, snapshot: Snapshot) -> SaveReport:
+        """Make the map on disk equal to the snapshot, which is used up.
+
+        Raises MapError (no space, no permission, a map not to be overwritten, another process saving); the map saved
+        before is then as it was.
+        """
+        with locked(self.path):
+            known = self._known_on_disk(snapshot)
+            try:
+                manifest, report = self._write(snapshot, known)
+            except OSError as error:
+                raise MapError(f"cannot save {self.path}: {error.strerror}; what was saved before is whole") from error
+        self._known, self._lineage = manifest, snapshot.lineage
+        return report
+
+    def _known_on_disk(self, snapshot: Snapshot) -> Manifest | None:
+        """The map on disk if the snapshot continues it."""
+        if not self.exists():
+            return None
+        on_disk = read_manifest(self.path)
+        if on_disk == self._known and self._lineage is snapshot.lineage:
+            return on_disk
+        if on_disk != self._known and not self._replace:
+            raise MapError(
+                f"{self.path} holds a map of {on_disk.keyframes} keyframes that was not loaded; "
+                "allowed: load it first, another path, or replace"
+            )
+        return None
+
+    def _write(self, snapshot: Snapshot, known: Manifest | None) -> tuple[Manifest, SaveReport]:
+        live: dict[int, KeyframeRecord] = {kf.ref.id: kf for kf in snapshot.keyframes}
+        snapshot.keyframes.clear()  # from here on a keyframe is let go once written
+        kept = _kept_segments(known.segments if known else (), live)
+        sessions = sessions_of(kf.ref for kf in live.values())
+        cameras = tuple(dict.fromkeys(kf.ref.camera for kf in live.values()))
+        keyframes = len(live)
+        for segment in kept:
+            for i in ids_of(segment.live):
+                del live[i]
+        unsaved = len(live)
+        unchanged = known is not None and not unsaved and kept == list(known.segments)
+        if (
+            unchanged
+            and known is not None
+            and (known.next_id, known.next_session) == (snapshot.next_id, snapshot.next_session)
+        ):
+            return known, SaveReport(self.path, keyframes, 0, 0)
+        generation = _last_generation(self.path) + 1
+        header = SegmentHeader(
+            self.fingerprint, snapshot.dim, cameras, tuple({kf.layouts: None for kf in live.values()})
+        )
+        borders = [_first_id(segment) for segment in kept]
+        written = write_segments(self.path, generation, header, _drain(live), borders)
+        manifest = Manifest(
+            self.fingerprint,
+            snapshot.dim,
+            generation,
+            snapshot.next_id,
+            snapshot.next_session,
+            keyframes,
+            cameras,
+            sessions,
+            tuple(sorted((*kept, *written), key=_first_id)),
+        )
+        commit(self.path, manifest, written)
+        return manifest, SaveReport(self.path, keyframes, unsaved, sum(s.bytes for s in written))
+
+
+def _drain(live: dict[int, KeyframeRecord]) -> Iterator[KeyframeRecord]:
+    for i in list(live):
+        yield live.pop(i)
+
+
+def _kept_segments(segments: Iterable[Segment], live: dict[int, KeyframeRecord]) -> list[Segment]:
+    """Those worth keeping on disk: at least half alive, and not one of many small ones."""
+    kept = []
+    for s in segments:
+        ids = ids_of(s.ids)
+        alive = [i for i in ids if i in live]
+        if alive and 2 * len(alive) >= len(ids):
+            kept.append(Segment(s.file, s.bytes, s.digest, s.ids, runs_of(alive)))
+    small = 0  # at the end, where every save adds one
+    while small < len(kept) and kept[-1 - small].bytes < _SMALL_BYTES:
+        small += 1
+    return kept[: len(kept) - small] if small >= _MANY_SMALL else kept
+
+
+def _first_id(segment: Segment) -> int:
+    return segment.ids[0][0]
+
+
+def sessions_of(refs: Iterable[ImageRef]) -> tuple[Session, ...]:
+    """The sessions of these keyframes."""
+    found: dict[int, list[int]] = {}
+    for ref in refs:
+        known = found.setdefault(ref.session, [0, ref.stamp_ns, ref.stamp_ns])
+        known[0] += 1
+        known[1], known[2] = min(known[1], ref.stamp_ns), max(known[2], ref.stamp_ns)
+    return tuple(Session(number, *found[number]) for number in sorted(found))
+
+
+def write_segments(
+    folder: Path,
+    generation: int,
+    header: SegmentHeader,
+    keyframes: Iterable[KeyframeRecord],
+    borders: Sequence[int] = (),
+) -> list[Segment]:
+    """Write keyframes (ascending ids) into as many new segments as they need. Raises OSError, leaving none behind.
+
+    No segment reaches over a border (ascending first ids of segments that stay), so that the ids of segments never
+    interleave and a map is read in order of ids.
+    """
+    done: list[Segment] = []
+    writer: SegmentWriter | None = None
+    try:
+        for kf in keyframes:
+            if writer is not None and bisect(borders, writer.ids[-1]) != bisect(borders, kf.ref.id):
+                done.append(_closed(writer))
+                writer = None
+            if writer is None:
+                writer = SegmentWriter(folder / f"segment-{generation:08d}-{len(done):04d}.pnv", header)
+            writer.add(kf)
+            if writer.nbytes > SEGMENT_BYTES:
+                done.append(_closed(writer))
+                writer = None
+        if writer is not None:
+            done.append(_closed(writer))
+    except BaseException:
+        if writer is not None:
+            writer.abandon()
+        _remove(folder, [s.file for s in done])
+        raise
+    return done
+
+
+def _closed(writer: SegmentWriter) -> Segment:
+    digest = writer.close()
+    runs: Runs = runs_of(writer.ids)
+    return Segment(writer.path.name, writer.nbytes, digest, runs, runs)
+
+
+def commit(folder: Path, manifest: Manifest, written: list[Segment]) -> None:
+    """Make the manifest the map, then remove what it does not name. Raises OSError, the map being as before."""
+    try:
+        write_manifest(folder, manifest)
+    except OSError:
+        _remove(folder, [NAME + ".new", *(s.file for s in written)])
+        raise
+    named = {NAME, _LOCK, *(s.file for s in manifest.segments)}
+    with suppress(OSError):
+        _remove(folder, [name for name in os.listdir(folder) if _OURS.fullmatch(name) and name not in named])
+
+
+def _remove(folder: Path, names: Iterable[str]) -> None:
+    for name in names:
+        with suppress(OSError):
+            os.unlink(folder / name)
+
+
+def _last_generation(folder: Path) -> int:
+    """The largest number any file there carries, so that no name is used twice."""
+    return max((int(path.name[8:16]) for path in segment_files(folder)), default=0)
+
+
+def segment_files(folder: Path) -> list[Path]:
+    """Every segment file there, named by a manifest or not, oldest first."""
+    return sorted(path for path in folder.glob("segment-*.pnv") if _OURS.fullmatch(path.name))
+
+
+def keyframes_of(folder: Path, manifest: Manifest) -> Iterator[SavedKeyframe]:
+    """The keyframes of a map by ascending id, each checked. Raises MapError at the first that is not whole."""
+    count = 0
+    for segment in manifest.segments:
+        live = set(ids_of(segment.live))
+        for kf in read_segment(folder / segment.file, segment.bytes, segment.digest):
+            if kf.ref.id in live:
+                count += 1
+                yield kf
+    if count != manifest.keyframes:
+        raise MapError(f"{folder}: {count} keyframes found; allowed: {manifest.keyframes}, as saved")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder against other processes, making it if need be. Raises MapError."""
+    try:
+        os.makedirs(folder, exist_ok=True)
+        strangers = [name for name in os.listdir(folder) if not _OURS.fullmatch(name)]
+        if strangers:
+            raise MapError(
+                f"{folder} holds {strangers[0]!r}, which is no part of a map; allowed: a new or a map folder"
+            )
+        handle = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o644)
+    except OSError as error:
+        raise MapError(f"cannot save {folder}: {error.strerror}; allowed: a writable folder") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise MapError(f"{folder} is being saved by another process") from error
+        yield
+    finally:
+        os.close(handle)
