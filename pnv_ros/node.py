@@ -13,8 +13,10 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from sensor_msgs.msg import CameraInfo
 
 from msg_adapters.camera_info import Rectifier
+from pnv_core.database import KeyframeDatabase
 from pnv_core.describer import Describer, describer_from
-from pnv_core.errors import ImageError, PnvError
+from pnv_core.errors import ConfigError, ImageError, MapError, PnvError
+from pnv_core.maps import Autosave, SaveReport
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
@@ -23,6 +25,7 @@ from pnv_ros.inputs import ImageInputs
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Parameters, Settings
 from pnv_ros.recognition import Recognition
+from pnv_ros.saved_map import SavedMap
 from pnv_ros.services import create_services
 from pnv_ros.slot import NewestFrames
 from pnv_ros.stamps import StampRule
@@ -52,6 +55,9 @@ class PlaceRecognizerNode(LifecycleNode):
         self._diagnostics: Diagnostics | None = None
         self._inputs: ImageInputs | None = None
         self._worker: Worker | None = None
+        self._map: SavedMap | None = None
+        self._infos: list[Any] = []
+        self._autosave: Autosave | None = None
         self._statistics = Statistics()
         self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
         create_services(self, self)
@@ -100,7 +106,7 @@ class PlaceRecognizerNode(LifecycleNode):
         return SUCCESS
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._autosave()
+        self._save_at_end()
         self._free()
         self.get_logger().info("cleaned up; the map is freed")
         return SUCCESS
@@ -110,14 +116,13 @@ class PlaceRecognizerNode(LifecycleNode):
         return SUCCESS
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        self._stop()
-        self._free()
+        self.stop()
         return SUCCESS
 
     def stop(self) -> None:
         """Finish the frame in hand, save if asked to, free everything. May be called twice."""
         self._stop()
-        self._autosave()
+        self._save_at_end()
         self._free()
 
     def report_failure(self, failure: BaseException) -> None:
@@ -128,10 +133,17 @@ class PlaceRecognizerNode(LifecycleNode):
     # Services
 
     def save(self) -> str:
-        raise PnvError("maps cannot be saved yet")
+        if self._map is None:
+            raise PnvError(NOT_CONFIGURED)
+        return f"saved {self._map.save()}"
 
     def load(self) -> str:
-        raise PnvError("maps cannot be loaded yet")
+        if self._map is None or self._recognition is None:
+            raise PnvError(NOT_CONFIGURED)
+        with self._recognition.still():
+            count = self._map.load()
+            self._recognition.map_was_replaced()
+        return f"loaded {count} keyframes from {self._map.path}; a new session begins"
 
     def reset(self) -> str:
         if self._recognition is None:
@@ -151,8 +163,18 @@ class PlaceRecognizerNode(LifecycleNode):
         config, start = self.settings.node, time.monotonic()
         views = self._views()
         describer = describer_from(self.settings.recogniser)
-        recognizer = PlaceRecognizer(self.settings.recogniser, describer, timer=StageTimer(time.perf_counter))
-        first = _warm_up(describer)
+        database = KeyframeDatabase.from_config(
+            describer.config, describer.model.global_dim, read_only=config.read_only
+        )
+        recognizer = PlaceRecognizer(
+            self.settings.recogniser, describer, database, timer=StageTimer(time.perf_counter)
+        )
+        per_keyframe = database.bytes_per_keyframe(_warm_up(describer))
+        if per_keyframe > database.bytes_budget:
+            raise ConfigError(
+                f"memory_budget_mb = {self.settings.recogniser.memory_budget_mb:g} holds no keyframe; "
+                f"allowed: at least {per_keyframe / 1e6:.3g}, better a hundred times as much"
+            )
         self._stamps = StampRule(config.on_stamp_back)
         outputs = Outputs(self, config, describer.image_size)
         self._recognition = Recognition(
@@ -163,7 +185,13 @@ class PlaceRecognizerNode(LifecycleNode):
             self.create_subscription(CameraInfo, topic, self._rectify(views[camera], camera), 1)
             for topic, camera in zip(config.camera_info_topics, config.image_topics, strict=False)
         ]
-        per_keyframe = recognizer.database.bytes_per_keyframe(first)
+        self._map = SavedMap(database, describer.fingerprint)
+        self._map.path = config.map_path
+        if config.load_on_start:
+            self.get_logger().info(self.load() if self._map.exists() else f"no map at {config.map_path} yet")
+        if config.autosave:
+            self._autosave = self._map.autosave(config.autosave_interval_s, self._report_autosave)
+            self._autosave.start()
         self.get_logger().info(
             self._summary(describer, per_keyframe) + f"\n  configured   in {time.monotonic() - start:.1f} s"
         )
@@ -208,6 +236,8 @@ class PlaceRecognizerNode(LifecycleNode):
     def _settings_changed(self, settings: Settings) -> None:
         if self._recognition is not None:
             self._recognition.change(settings)
+        if self._map is not None:
+            self._map.path = settings.node.map_path
 
     def _every_second(self) -> None:
         recognition, inputs, diagnostics = self._recognition, self._inputs, self._diagnostics
@@ -225,12 +255,16 @@ class PlaceRecognizerNode(LifecycleNode):
             self._worker.stop()
             self._worker = None
 
-    def _autosave(self) -> None:
-        if self._recognition is not None and self.settings.node.autosave:
-            try:
-                self.get_logger().info(self.save())
-            except (PnvError, OSError, MemoryError) as error:
-                self.get_logger().error(f"the map is not saved: {error}")
+    def _report_autosave(self, done: SaveReport | MapError) -> None:
+        if isinstance(done, MapError):
+            self.get_logger().error(f"autosave: {done}")
+        else:
+            self.get_logger().info(f"autosaved {done}")
+
+    def _save_at_end(self) -> None:
+        if self._autosave is not None:
+            self._autosave.stop()
+            self._autosave = None
 
     def _free(self) -> None:
         if self._recognition is not None:
@@ -239,7 +273,7 @@ class PlaceRecognizerNode(LifecycleNode):
                 self.destroy_subscription(subscription)
         if self._diagnostics is not None:
             self._diagnostics.close()
-        self._recognition = self._diagnostics = None
+        self._recognition = self._diagnostics = self._map = None
 
     def _changing_state(self, change: Callable[..., Any]) -> Callable[..., Any]:
         """A transition that the present state does not allow is answered with false, where rclpy raises."""

@@ -37,13 +37,16 @@ class NodeConfig:
         "frames whose stamp goes back by 1 s or more (a bag in a loop): skip them, or begin a new session",
         choices=("skip", "new_session"),
     )
-    no_image_warning_s: float = setting(5.0, "warn when no image came for so long", unit="s", low=0.1, live=True)
+    no_image_warning_s: float = setting(
+        5.0, "warn when no image came for so long", unit="s", low=0.1, high=1e6, live=True
+    )
 
     # Life
     autostart: bool = setting(True, "configure and activate at start; false leaves that to a life-cycle manager")
-    map_path: str = setting("", "file that ~/save writes and ~/load reads", live=True)
-    load_on_start: bool = setting(False, "load map_path when configuring")
-    autosave: bool = setting(False, "save to map_path at shutdown and clean-up", live=True)
+    map_path: str = setting("", "folder that ~/save writes and ~/load reads", live=True)
+    load_on_start: bool = setting(False, "load map_path when configuring, if there is a map")
+    autosave: bool = setting(False, "save to map_path every autosave_interval_s, at shutdown and at clean-up")
+    autosave_interval_s: float = setting(300.0, "time between autosaves", unit="s", low=1.0, high=1e6)
     read_only: bool = setting(False, "localise in the loaded map: nothing is added to it")
 
     # Outputs
@@ -52,14 +55,14 @@ class NodeConfig:
     publish_match_image: bool = setting(True, "publish ~/match_image while somebody subscribes", live=True)
     publish_lio_sam: bool = setting(True, "publish ~/lio_sam", live=True)
     lio_sam_interval_s: float = setting(
-        1.0, "least time between the queries of ~/lio_sam", unit="s", low=0.0, live=True
+        1.0, "least time between the queries of ~/lio_sam", unit="s", low=0.0, high=1e6, live=True
     )
     lio_sam_gap_s: float = setting(
-        30.0, "least time between query and match of ~/lio_sam", unit="s", low=0.0, live=True
+        30.0, "least time between query and match of ~/lio_sam", unit="s", low=0.0, high=1e6, live=True
     )
     frame_id: str = setting("map", "frame of ~/markers where poses name none", live=True)
     thumbnails_mb: float = setting(
-        32.0, "memory for small keyframe pictures, shown in ~/match_image; 0 = none", unit="MB", low=0.0
+        32.0, "memory for small keyframe pictures, shown in ~/match_image; 0 = none", unit="MB", low=0.0, high=1e5
     )
 
     def __post_init__(self) -> None:
@@ -77,4 +80,4 @@ class NodeConfig:
             )
         for name in ("load_on_start", "autosave", "read_only"):
             if getattr(self, name) and not self.map_path:
-                raise ConfigError(f"{name} is true but map_path is empty; allowed: a file")
+                raise ConfigError(f"{name} is true but map_path is empty; allowed: a folder")

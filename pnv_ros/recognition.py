@@ -56,7 +56,15 @@ class Recognition:
             count = len(self.recognizer.database)
             self.recognizer.reset()
             self.thumbnails.clear()
+            self.outputs.markers.forget()
             return count
+
+    def map_was_replaced(self) -> None:
+        """A map was loaded, which began a session. To be called while still."""
+        self.recognizer.keyframes.forget()
+        self.thumbnails.clear()
+        self.outputs.new_session()
+        self.outputs.markers.forget()
 
     def work(self, waiting: WaitingFrame) -> None:
         """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""

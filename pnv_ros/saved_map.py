@@ -1,0 +1,54 @@
+"""The map on disk that belongs to a running node."""
+
+import threading
+from collections.abc import Callable
+
+from pnv_core.database import KeyframeDatabase, Snapshot
+from pnv_core.errors import MapError
+from pnv_core.maps import Autosave, MapStore, SaveReport
+
+
+class SavedMap:
+    """Saves and loads a database at a path that may change; one thread at a time."""
+
+    def __init__(self, database: KeyframeDatabase, fingerprint: str) -> None:
+        self._database, self._fingerprint = database, fingerprint
+        self._store: MapStore | None = None
+        self._lock = threading.Lock()
+        self._path = ""
+
+    @property
+    def path(self) -> str:
+        return self._path
+
+    @path.setter
+    def path(self, path: str) -> None:
+        with self._lock:
+            if path != self._path:
+                self._path, self._store = path, MapStore(path, self._fingerprint) if path else None
+
+    def exists(self) -> bool:
+        """Whether a map was saved there before."""
+        return self._opened().exists()
+
+    def save(self, snapshot: Snapshot | None = None) -> SaveReport:
+        """Save the database, or a snapshot of it. Raises MapError; the map on disk is then as it was."""
+        store = self._opened()
+        with self._lock:
+            return store.save(snapshot or self._database.snapshot())
+
+    def load(self) -> int:
+        """Replace the database's content and begin a new session; the number of keyframes. Raises MapError."""
+        store = self._opened()
+        with self._lock:
+            store.load(self._database)
+            return len(self._database)
+
+    def autosave(self, interval_s: float, report: Callable[[SaveReport | MapError], None]) -> Autosave:
+        """Saves every so often once started, and when stopped."""
+        return Autosave(self._database, self, interval_s, report)  # type: ignore[arg-type]
+
+    def _opened(self) -> MapStore:
+        if self._store is None:
+            raise MapError("map_path is empty; allowed: a folder, set by the parameter map_path")
+        return self._store
