@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pnv_core.config import Config
 from pnv_core.describer import describer_from
 from pnv_core.evaluation.datasets.dataset import Dataset
+from pnv_core.evaluation.datasets.geometry import pose_errors
 from pnv_core.evaluation.dense_vlad import fitted_dense_vlad
 from pnv_core.evaluation.extraction import Describing, Extraction, Progress, leading
 from pnv_core.evaluation.methods import Method
@@ -274,6 +275,20 @@ def _one_per_group(ranking: Ranking, groups: NDArray[np.int64]) -> Ranking:
     position = {int(r): i for i, r in enumerate(ranking.references)}
     rows = np.array([position[int(r)] for r in kept], np.int64)
     return Ranking(kept, ranking.scores[rows], int((rows < ranking.reranked).sum()), ranking.seconds)
+
+
+def localised(result: MethodResult, tolerances: Sequence[tuple[float, float]]) -> list[float]:
+    """Share of the queries with a known pose whose best reference's pose is within each (metres, degrees)."""
+    dataset = result.dataset
+    if dataset.query_poses is None or dataset.reference_poses is None:
+        return []
+    rows = [q for q in range(len(dataset.queries)) if np.isfinite(dataset.query_poses[q]).all()]
+    if not rows:
+        return [float("nan")] * len(tolerances)
+    answered = [q for q in rows if len(result.rankings[q].references)]
+    best = np.array([result.rankings[q].references[0] for q in answered], np.int64)
+    metres, degrees = pose_errors(dataset.reference_poses[best], dataset.query_poses[answered])
+    return [float(((metres <= m) & (degrees <= d)).sum()) / len(rows) for m, d in tolerances]
 
 
 def decisions(rankings: Sequence[Ranking], dataset: Dataset) -> Decisions:

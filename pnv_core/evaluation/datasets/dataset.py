@@ -20,7 +20,8 @@ class Dataset:
     excluded: per query the references that may not be found (the image itself, or frames just seen).
     groups: (R,) references of equal number count as one answer (the cut-outs of a panorama).
     conditions: per query a word to split the results by. `*_poses`: (N, 4, 4) camera to world, where tolerances ask
-    for poses. `names`: how the benchmark calls each query.
+    for poses. `names`: how the benchmark calls each query. Of a sequence (queries = references, in time order)
+    `query_positions` (Q, 3) in metres and `stamps` (Q,) in seconds are kept for the report.
     """
 
     name: str
@@ -35,6 +36,8 @@ class Dataset:
     reference_poses: NDArray[np.float64] | None = None
     names: tuple[str, ...] = ()
     sequence: bool = False
+    query_positions: NDArray[np.float64] | None = None
+    stamps: NDArray[np.float64] | None = None
     notes: tuple[str, ...] = field(default=())
 
     def __post_init__(self) -> None:
@@ -66,6 +69,8 @@ class Dataset:
             truth=tuple(self.truth[i] for i in rows),
             excluded=None if self.excluded is None else tuple(self.excluded[i] for i in rows),
             conditions=tuple(self.conditions[i] for i in rows) if self.conditions else (),
+            query_positions=None if self.query_positions is None else self.query_positions[np.asarray(rows)],
+            stamps=None if self.stamps is None else self.stamps[np.asarray(rows)],
             query_poses=None if self.query_poses is None else self.query_poses[np.asarray(rows)],
             names=tuple(self.names[i] for i in rows) if self.names else (),
         )
