@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension
 
 from pnv_core.errors import PnvError
-from pnv_core.types import ImageRef, LoopClosure
+from pnv_core.types import ImageRef, LoopClosure, Reason
 
 COLUMNS = (
     "query_stamp",
@@ -32,7 +32,7 @@ COLUMNS = (
 
 NO_CAMERA = -1  # a match in a saved map whose camera is not among the topics of this run
 
-_FIELDS = {
+CANDIDATE_FIELDS = {
     "query_sec": "<i4",
     "query_nsec": "<u4",
     "match_sec": "<i4",
@@ -48,7 +48,8 @@ _FIELDS = {
     "accepted": "<u1",
     "reason": "<u1",
 }
-_TABLE = np.dtype([*_FIELDS.items(), ("padding", "V6")])  # rows stay aligned to 8 bytes
+_TABLE = np.dtype([*CANDIDATE_FIELDS.items(), ("padding", "V6")])  # rows stay aligned to 8 bytes
+_REASON_CODES = {reason: code for code, reason in enumerate(Reason)}
 _POINT_TYPES = {
     "i4": PointField.INT32,
     "u4": PointField.UINT32,
@@ -136,12 +137,10 @@ def closure_to_lio_sam(closure: LoopClosure) -> Float64MultiArray:
     return Float64MultiArray(data=[epoch_seconds(closure.query.stamp_ns), epoch_seconds(closure.match.stamp_ns)])
 
 
-def candidates_to_message(
-    closures: Sequence[LoopClosure], cameras: Sequence[str], reasons: Sequence[str], frame_id: str = ""
-) -> PointCloud2:
-    """Every candidate examined as a typed table, one point per candidate; `reason` is the index in `reasons`.
+def candidates_to_message(closures: Sequence[LoopClosure], cameras: Sequence[str], frame_id: str = "") -> PointCloud2:
+    """Every candidate examined as a typed table, one point per candidate; `reason` is the number in Reason's order.
 
-    An accepted candidate has reason 0; a reason that is not listed is 255. The header carries the query's stamp.
+    The header carries the query's stamp.
     """
     table = np.zeros(len(closures), _TABLE)
     for row, c in zip(table, closures, strict=True):
@@ -151,22 +150,17 @@ def candidates_to_message(
             row[f"{side}_camera"] = _camera_index(ref.camera, cameras)
         for name in ("score", "similarity", "spatial", "inliers", "accepted"):
             row[name] = getattr(c, name)
-        row["reason"] = 0 if c.accepted else reason_code(c.reason, reasons)
+        row["reason"] = _REASON_CODES[c.reason]
     message = PointCloud2(height=1, width=len(table), point_step=_TABLE.itemsize, row_step=table.nbytes, is_dense=True)
     message.header.frame_id = frame_id
     if closures:
         message.header.stamp = to_time(closures[0].query.stamp_ns)
     offset = 0
-    for name, kind in _FIELDS.items():
+    for name, kind in CANDIDATE_FIELDS.items():
         message.fields.append(PointField(name=name, offset=offset, datatype=_POINT_TYPES[kind[1:]], count=1))
         offset += np.dtype(kind).itemsize
     message.data = table.tobytes()
     return message
-
-
-def reason_code(reason: str, reasons: Sequence[str]) -> int:
-    """The number of a reason whose words start with a listed one; 255 where none does."""
-    return next((i for i, known in enumerate(reasons) if known and reason.startswith(known)), 255)
 
 
 def _camera_index(camera: str, cameras: Sequence[str]) -> int:

@@ -12,7 +12,7 @@ from geometry_msgs.msg import Point, PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, qos_profile_sensor_data
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy, qos_profile_sensor_data
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -20,7 +20,9 @@ from msg_adapters.images import stamp_of
 from pnv_core.types import ImageRef, LoopClosure
 from pnv_ros.node_config import NodeConfig
 
-MARKERS_QOS = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+MARKERS_QOS = QoSProfile(
+    depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
+)
 
 _KEPT_POSES = 20_000  # 200 s at 100 Hz; keyframes take theirs within a second
 _KEPT_CLOSURES = 2000

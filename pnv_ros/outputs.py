@@ -12,7 +12,7 @@ from std_msgs.msg import Float64MultiArray
 from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam, closures_to_message
 from msg_adapters.pictures import rgb_to_message
 from pnv_core.drawing import draw_match
-from pnv_core.types import Frame, LoopClosure, Reason
+from pnv_core.types import Frame, LoopClosure
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.thumbnails import Thumbnails
@@ -22,8 +22,6 @@ CLOSURES_QOS = QoSProfile(
 )
 TABLE_QOS = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
 PICTURE_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE)
-
-REASONS = tuple(str(reason) for reason in Reason)  # the wire codes of ~/candidates
 
 
 class Outputs:
@@ -55,9 +53,7 @@ class Outputs:
             self._publish_lio_sam(accepted)
             self.markers.add(accepted)
         if self.config.publish_candidates and self._candidates.get_subscription_count():
-            self._candidates.publish(
-                candidates_to_message(closures, self._cameras, REASONS, self.config.frame_id)
-            )
+            self._candidates.publish(candidates_to_message(closures, self._cameras, self.config.frame_id))
         if self.config.publish_match_image and self._match_image.get_subscription_count():
             self._match_image.publish(self._picture(frame, closures[0], thumbnails))
 

@@ -1,7 +1,6 @@
 """LoopClosure lists to and from the messages other programs read."""
 
 import math
-import struct
 
 import pytest
 from hypothesis import given
@@ -15,7 +14,8 @@ from msg_adapters.loop_closures import (
     closures_to_message,
 )
 from pnv_core.errors import PnvError
-from pnv_core.types import ImageRef, LoopClosure
+from pnv_core.types import ImageRef, LoopClosure, Reason
+from test.ros.tables import rows_of
 
 CAMERAS = ("front", "rear")
 stamps = st.one_of(st.integers(0, (2**31 - 1) * 10**9 + 999_999_999),
@@ -29,7 +29,9 @@ closures = st.builds(
 )  # fmt: skip
 
 
-def closure(accepted=True, reason="", query_ns=1_700_000_100_000_000_001, match_ns=1_700_000_000_999_999_999):
+def closure(
+    accepted=True, reason=Reason.ACCEPTED, query_ns=1_700_000_100_000_000_001, match_ns=1_700_000_000_999_999_999
+):
     return LoopClosure(ImageRef(41, query_ns, "rear"), ImageRef(7, match_ns, "front"), 0.75, 0.5, 0.25, 60, accepted,
                        reason)  # fmt: skip
 
@@ -81,19 +83,22 @@ def test_lio_sam_gets_exactly_two_doubles():
 
 
 def test_candidates_are_a_table_that_point_cloud_readers_understand():
-    refused = closure(accepted=False, reason="spatial 0.1 < 0.2")
-    other = closure(accepted=False, reason="unheard of")
-    message = candidates_to_message([closure(), refused, other], CAMERAS, ("", "texture", "spatial"))
-    assert (message.width, message.height, message.row_step) == (3, 1, 3 * message.point_step)
+    refused = closure(accepted=False, reason=Reason.LOW_TEXTURE)
+    message = candidates_to_message([closure(), refused], CAMERAS)
+    assert (message.width, message.height, message.row_step) == (2, 1, 2 * message.point_step)
     assert (message.header.stamp.sec, message.header.stamp.nanosec) == (1_700_000_100, 1)
-    codes = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}  # sensor_msgs/PointField
-    rows = [
-        {f.name: struct.unpack_from("<" + codes[f.datatype], message.data, at + f.offset)[0] for f in message.fields}
-        for at in range(0, len(message.data), message.point_step)
-    ]
+    rows = rows_of(message)
     assert rows[1] == {
         "query_sec": 1_700_000_100, "query_nsec": 1, "match_sec": 1_700_000_000, "match_nsec": 999_999_999,
         "query_id": 41, "match_id": 7, "query_camera": 1, "match_camera": 0, "score": 0.75, "similarity": 0.5,
         "spatial": 0.25, "inliers": 60, "accepted": 0, "reason": 2,
     }  # fmt: skip
-    assert [(r["accepted"], r["reason"]) for r in rows] == [(1, 0), (0, 2), (0, 255)]
+    assert (rows[0]["accepted"], rows[0]["reason"]) == (1, 0)
+
+
+def test_reason_codes_on_the_wire_never_change():
+    codes = [rows_of(candidates_to_message([closure(False, r)], CAMERAS))[0]["reason"] for r in Reason]
+    assert codes == list(range(len(Reason)))
+    assert [r.value for r in Reason][:6] == [
+        "", "low_score", "low_texture", "unconfirmed", "odometry", "not_reranked",
+    ]  # fmt: skip

@@ -1,0 +1,108 @@
+"""Parameter files, launch files and the interface page say what the code declares."""
+
+import runpy
+import sys
+from types import ModuleType
+
+import pytest
+import yaml
+
+from pnv_core.config import PRESETS
+from pnv_core.settings import settings_of
+from pnv_ros import reference
+from pnv_ros.node_config import NodeConfig
+from pnv_ros.parameters import DECLARED, NODE, RECOGNISER, descriptor_of, preset_defaults
+from test.ros.processes import ROOT
+
+LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
+
+
+def test_config_files_and_interface_page_are_as_the_code_declares():
+    for path, text in reference.files(ROOT).items():
+        assert path.read_text() == text, f"{path} is stale: run python -m pnv_ros.reference"
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_parameter_file_holds_every_parameter_at_an_allowed_value(preset):
+    text = (ROOT / "config" / f"{preset}.yaml").read_text()
+    values = yaml.safe_load(text)["/**"]["ros__parameters"]
+    for name, setting in DECLARED.items():
+        assert f"{name}: " in text
+        if name in values:
+            assert setting.check(values[name]) == preset_defaults(preset)[name]
+
+
+def test_settings_of_node_and_recogniser_have_different_names():
+    assert not set(RECOGNISER) & set(NODE)
+    assert settings_of(NodeConfig) == NODE
+
+
+def test_every_parameter_is_described_with_its_range():
+    for setting in DECLARED.values():
+        descriptor = descriptor_of(setting)
+        assert descriptor.description
+        assert descriptor.additional_constraints
+        numeric = setting.kind in (int, float) and not setting.many and setting.low is not None
+        assert bool(descriptor.integer_range or descriptor.floating_point_range) == numeric
+
+
+class _Call:
+    """Remembers what a launch file constructs."""
+
+    def __init__(self, name, log, *args, **kwargs):
+        self.name, self.args, self.kwargs = name, args, kwargs
+        log.append(self)
+
+
+def _stubs(log):
+    """Stand-ins for the launch packages, which no wheel offers."""
+    names = {
+        "launch": ["LaunchDescription"],
+        "launch.actions": [
+            "DeclareLaunchArgument", "EmitEvent", "ExecuteProcess", "RegisterEventHandler", "TimerAction",
+        ],
+        "launch.event_handlers": ["OnProcessExit"],
+        "launch.events": ["Shutdown"],
+        "launch.substitutions": ["LaunchConfiguration", "PathJoinSubstitution"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.parameter_descriptions": ["ParameterValue"],
+        "launch_ros.substitutions": ["FindPackageShare"],
+    }  # fmt: skip
+    modules = {}
+    for module, classes in names.items():
+        modules[module] = ModuleType(module)
+        for name in classes:
+            make = lambda *args, _name=name, **kwargs: _Call(_name, log, *args, **kwargs)  # noqa: E731
+            setattr(modules[module], name, make)
+    return modules
+
+
+@pytest.mark.parametrize("path", LAUNCH_FILES, ids=lambda p: p.name)
+def test_launch_files_name_only_what_exists(path, monkeypatch):
+    log: list[_Call] = []
+    for name, module in _stubs(log).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    runpy.run_path(str(path))["generate_launch_description"]()
+
+    declared = {c.args[0]: c.kwargs for c in log if c.name == "DeclareLaunchArgument"}
+    assert all(kwargs["description"] for kwargs in declared.values())
+    assert {c.args[0] for c in log if c.name == "LaunchConfiguration"} == set(declared)
+    nodes = [c for c in log if c.name == "Node"]
+    assert len(nodes) == 1
+    assert (nodes[0].kwargs["package"], nodes[0].kwargs["executable"]) == ("pnv_ros", "place_recognizer")
+    given = [name for part in nodes[0].kwargs["parameters"] if isinstance(part, dict) for name in part]
+    assert set(given) - {"use_sim_time"} <= set(DECLARED)
+    for name in set(declared) & set(DECLARED):
+        if "default_value" in declared[name]:
+            DECLARED[name].check(yaml.safe_load(declared[name]["default_value"] or "''"))
+    for join in (c for c in log if c.name == "PathJoinSubstitution"):
+        _, folder, (argument, suffix) = join.args[0]
+        assert argument.args == ("preset",)
+        assert all((ROOT / folder / (preset + suffix)).is_file() for preset in PRESETS)
+
+
+def test_there_is_a_launch_file_for_a_bag_and_one_for_two_cameras():
+    assert [p.name for p in LAUNCH_FILES] == [
+        "bag.launch.py", "place_recognizer.launch.py", "two_cameras.launch.py",
+    ]  # fmt: skip
