@@ -29,10 +29,11 @@ $(READY): setup.py setup.cfg pyproject.toml
 
 demo: $(READY)
 	$(BIN)/python -m examples.demo $(if $(IMAGES),--images "$(IMAGES)") $(if $(VIDEO),--video "$(VIDEO)") \
-	    $(if $(BAG),--bag "$(BAG)")
+	    $(if $(BAG),--bag "$(BAG)") $(ARGS)
 
 slam-demo: $(READY)
-	$(BIN)/python -m examples.pose_graph
+	$(BIN)/python -c "import gtsam, evo" 2>/dev/null || $(BIN)/pip install --progress-bar off -q -e ".[slam]"
+	$(BIN)/python -m examples.pose_graph $(ARGS)
 
 test: $(READY)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest $(ARGS)

@@ -38,6 +38,12 @@ DEVELOPMENT = [
     "setuptools<80",  # 80 removed the develop options that `colcon build --symlink-install` passes
 ]
 
+SLAM = [
+    "gtsam>=4.2",  # examples/pose_graph
+    "evo>=1.28",
+    "matplotlib>=3.8",
+]
+
 setup(
     name=PACKAGE,
     version="0.1.0",
@@ -57,7 +63,7 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*")),
     ],
     install_requires=REQUIRED,
-    extras_require={"ros": ROS, "dev": DEVELOPMENT},
+    extras_require={"ros": ROS, "dev": DEVELOPMENT, "slam": SLAM},
     entry_points={
         "console_scripts": [
             "place_recognizer = pnv_ros.place_recognizer:main",

@@ -1,0 +1,109 @@
+"""make slam-demo: loop closures of the real node correct a drifting odometry, live, in a pose graph on GTSAM.
+
+For every walk the node, a publisher and a back end talk over the real middleware. Then the recorded closures meet
+other drifts and injected false closures, with and without the robust solution. Writes slam.png, slam.csv and each
+walk's trajectories. Ends with 1 where a trajectory got worse or fewer than all errors were halved.
+"""
+
+import argparse
+import csv
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from scipy.spatial.transform import Rotation
+
+from examples.pose_graph.back_end import BackEndNode
+from examples.pose_graph.drift import drifted
+from examples.pose_graph.graph import PoseGraph
+from examples.pose_graph.report import Result, plot, print_table, write_tables
+from examples.pose_graph.sequences import Array, Walk, walks
+from examples.processes import isolated_environment, node_process, publisher_process
+from examples.publisher import IMAGE_TOPIC
+from pnv_core.errors import PnvError
+from pnv_core.types import LoopClosure
+
+_LATE_S = 4.0  # the node may still work on the last frames
+_SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="make slam-demo", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", metavar="NAME", help="walks to run, by the start of their names")
+    parser.add_argument("--data", type=Path, default=_SHARED, help="folder of recorded walks; default ../shared/data")
+    parser.add_argument("--seed", type=int, default=0, help="of the odometry's drift")
+    parser.add_argument("--trials", type=int, default=10, help="further drifts each walk's closures are tried with")
+    parser.add_argument("--parameter", action="append", default=[], metavar="NAME:=VALUE", help="of the node")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder of what is written; default out")
+    args = parser.parse_args()
+    chosen = [w for w in walks(args.data) if not args.only or any(w.name.startswith(name) for name in args.only)]
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        results = []
+        for walk in chosen:
+            odometry = drifted(walk.truth, walk.drift, args.seed)
+            closures, corrected = live(walk, odometry, args.parameter)
+            results.append(Result.of(walk, odometry, corrected, closures, args.trials))
+            print(results[-1].sentence(), flush=True)
+    except PnvError as error:
+        print(f"slam-demo: {error}", file=sys.stderr)
+        return 2
+    except (KeyboardInterrupt, ExternalShutdownException):
+        print("slam-demo: interrupted", file=sys.stderr)
+        return 130
+    print_table(results)
+    plot(results, args.out / "slam.png")
+    write_tables(results, args.out)
+    print(f"written: {args.out / 'slam.png'}, {args.out / 'slam.csv'} and trajectories in TUM format")
+    return 0 if results and all(result.halved for result in results) else 1
+
+
+def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[LoopClosure], Array]:
+    """Play a walk through node and back end: the closures that arrived and the corrected poses (n, 4, 4)."""
+    environment = isolated_environment()
+    rclpy.init(args=[])
+    back_end = BackEndNode(PoseGraph(walk.noise))
+    parameters = {"image_topics": [IMAGE_TOPIC], **walk.parameters}
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "odometry.csv"
+        _write_odometry(table, walk.stamps_ns, odometry)
+        flags = [*walk.flags, "--playback", str(walk.playback), "--odometry", str(table)]
+        try:
+            with (
+                node_process(environment, parameters, assignments, None) as node,
+                publisher_process(environment, flags) as publisher,
+            ):
+                ended = None
+                while ended is None or time.monotonic() - ended < _LATE_S:
+                    rclpy.spin_once(back_end, timeout_sec=0.1)
+                    if node.return_code is not None:
+                        raise PnvError(f"the node ended with {node.return_code}:\n" + "\n".join(node.lines[-15:]))
+                    if ended is None and publisher.return_code is not None:
+                        ended = time.monotonic()
+                if publisher.return_code:
+                    raise PnvError("\n".join(line for line in publisher.lines if not line.startswith("{")))
+            back_end.correct()
+            if len(back_end.back_end.stamps) != len(walk.stamps_ns):
+                count = len(back_end.back_end.stamps)
+                raise PnvError(f"{walk.name}: {count} of {len(walk.stamps_ns)} odometry messages arrived")
+            return list(back_end.back_end.used), back_end.back_end.graph.poses
+        finally:
+            back_end.destroy_node()
+            rclpy.try_shutdown()
+
+
+def _write_odometry(path: Path, stamps_ns: list[int], poses: Array) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["stamp_ns", "x", "y", "z", "qx", "qy", "qz", "qw"])
+        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        for stamp, pose, quaternion in zip(stamps_ns, poses, quaternions, strict=True):
+            writer.writerow([stamp, *np.round(pose[:3, 3], 6), *np.round(quaternion, 9)])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

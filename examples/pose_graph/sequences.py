@@ -1,0 +1,90 @@
+"""The walks of the SLAM demo: how each is published, its true poses, and how its recogniser and graph are set."""
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from examples.pose_graph.drift import Drift
+from examples.pose_graph.graph import Noise
+from pnv_core.worlds import Pose, loop_sequence
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Walk:
+    """A sequence with known poses. `flags` name it to the publisher; `parameters` are the node's."""
+
+    name: str
+    flags: list[str]
+    stamps_ns: list[int]
+    truth: Array  # (n, 4, 4), x ahead, y left, z up
+    playback: float
+    drift: Drift
+    noise: Noise
+    parameters: dict[str, Any] = field(default_factory=dict)
+
+
+def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -> Walk:
+    """A rendered place, walked on after the loop has closed."""
+    sequence = loop_sequence(seed, kind, laps=laps, speed_m_s=speed, fps=2.0)
+    flags = ["--world", kind, "--seed", str(seed), "--laps", str(laps), "--speed", str(speed)]
+    noise = Noise(tolerance_m=tolerance_m)
+    return Walk(f"{kind} {seed}", flags, list(sequence.stamps_ns), sequence.matrices, 2.0, Drift(), noise)
+
+
+def icl_office(folder: Path) -> Walk:
+    """ICL-NUIM office kt3, carried by hand: 7.7 m of way, one turn around. The end returns to the start.
+
+    Its poses have x right, y down, z ahead and the heading to the right; the way is short for its turns, so the
+    drift is that of the turns.
+    """
+
+    def pose(x: float, y: float, z: float, yaw: float) -> Pose:
+        return Pose(z, -x, -y, -yaw)
+
+    stamps, truth = _poses(folder / "poses.csv", pose)
+    drift = Drift(deg_per_m=0.0, turn=0.08)
+    parameters = {"exclude_recent_s": 15.0, "min_interval_s": 0.3}
+    noise = Noise(tolerance_m=0.3, tolerance_deg=10.0)
+    return Walk("icl_office_kt3", _flags(folder), stamps, truth, 0.7, drift, noise, parameters)
+
+
+def ikuta_campus(folder: Path) -> Walk:
+    """A campus, 217 m around. Keyframes are 3 m apart; only the last two see the first two again, 6 to 9 m away."""
+    stamps, truth = _poses(folder / "poses.csv", lambda x, y, z, yaw: Pose(x, y, z, yaw))
+    noise = Noise(tolerance_m=5.0)
+    parameters = {"consistency": 1}
+    return Walk("ikuta_campus", _flags(folder), stamps, truth, 2.5, Drift(), noise, parameters)
+
+
+def _flags(folder: Path) -> list[str]:
+    return ["--images", str(folder / "images"), "--timestamps", str(folder / "poses.csv")]
+
+
+def _poses(path: Path, pose: Callable[..., Pose]) -> tuple[list[int], Array]:
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    stamps = [round(float(row["timestamp"]) * 1e9) for row in rows]
+    truth = [pose(*(float(row[key]) for key in ("x", "y", "z", "yaw"))).matrix() for row in rows]
+    return stamps, np.array(truth)
+
+
+def walks(shared: Path) -> list[Walk]:
+    """Three rendered places, and the recorded walks whose data is there."""
+    rendered = [
+        world("corridor", 1, 1.4, 1.0, 1.0),
+        world("hall", 2, 1.4, 1.0, 1.0),
+        world("street", 2, 1.25, 2.0, 1.5),
+    ]
+    recorded = [
+        build(shared / name)
+        for name, build in (("icl_office_kt3_synth", icl_office), ("ikuta_campus_loop", ikuta_campus))
+        if (shared / name / "poses.csv").is_file()
+    ]
+    return rendered + recorded
