@@ -28,7 +28,7 @@ def within_pose(queries: Floats, references: Floats, radius: float, angle: float
 
     A query pose of NaN (unknown) has no true reference.
     """
-    known: NDArray[np.bool_] = np.isfinite(queries).reshape(len(queries), -1).all(1)
+    known = np.isfinite(queries.sum((1, 2)))
     near = iter(within_radius(queries[known, :3, 3], references[:, :3, 3], radius))
     truth = []
     for pose, is_known in zip(queries, known, strict=True):
