@@ -4,6 +4,7 @@ Both policies see keyframes in the order they were added and name one id at a ti
 """
 
 import heapq
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -113,7 +114,7 @@ class Densest:
 
 def make_eviction(name: str) -> Eviction:
     """The policy of this name. Raises ConfigError."""
-    policies = {"oldest": Oldest, "densest": Densest}
+    policies: dict[str, Callable[[], Eviction]] = {"oldest": Oldest, "densest": Densest}
     if name not in policies:
         raise ConfigError(f"eviction = {name!r} is out of range; allowed: one of {', '.join(policies)}")
     return policies[name]()

@@ -7,7 +7,7 @@ IVF-PQ are slower than the scan at equal recall up to 1,000,000 rows, and poor o
 """
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +67,7 @@ class PqScanIndex:
     """
 
     def __init__(self, table: VectorTable) -> None:
-        import faiss
-
+        faiss = _faiss()
         dim = table.dim
         if dim % 2:
             raise ConfigError(
@@ -105,11 +104,11 @@ class PqScanIndex:
             self._codes.add(self._table.vectors[start : min(rows, start + 8192)] @ self._rotation)
 
     def _overwrite(self, slot: int) -> None:
-        import faiss
-
+        faiss = _faiss()
         code = self._codes.pq.compute_codes(self._table.vectors[slot : slot + 1] @ self._rotation)[0]
         packed = faiss.rev_swig_ptr(self._codes.codes.get(), self._codes.codes.size())
-        self._packer.pack_1(code, slot, packed.reshape(-1, self._packer.block_size))
+        block, place = divmod(slot, self._packer.nvec)
+        self._packer.pack_1(code, place, packed.reshape(-1, self._packer.block_size)[block : block + 1])
 
     def remove(self, slot: int) -> None:
         pass  # `allowed` leaves it out until the row is reused
@@ -135,38 +134,38 @@ class FaissIndex:
         self._table = table
         self._build = build
         self._row_bytes = row_bytes
-        self._faiss: Any = None
+        self._built: Any = None
         self._slots = np.zeros(1024, np.int64)  # (rows of the FAISS index or more,) table row of each
         self._place: dict[int, int] = {}  # table row -> row of the FAISS index
         self._trained_on = 0
 
     @property
     def _rows(self) -> int:
-        return self._faiss.ntotal if self._faiss is not None else 0
+        return self._built.ntotal if self._built is not None else 0
 
     def nbytes(self, more: int = 0) -> int:
         return 2 * self._row_bytes * (max(self._rows, len(self._place)) + more)  # FAISS grows its arrays by doubling
 
     def add(self, slot: int) -> None:
         self._place[slot] = -1
-        if self._faiss is None or self._rows >= 2 * max(1024, len(self._place)) or self._outgrown():
+        if self._built is None or self._rows >= 2 * max(1024, len(self._place)) or self._outgrown():
             if len(self._place) >= 1024:
                 self._rebuild()
         else:
             self._append(np.array([slot]))
 
     def _outgrown(self) -> bool:
-        return not hasattr(self._faiss, "hnsw") and len(self._place) > 4 * self._trained_on  # lists, by the first rows
+        return not hasattr(self._built, "hnsw") and len(self._place) > 4 * self._trained_on  # lists, by the first rows
 
     def _rebuild(self) -> None:
         slots = np.sort(np.fromiter(self._place, np.int64))
-        self._faiss = self._build(len(slots), self._table.vectors[slots])
+        self._built = self._build(len(slots), self._table.vectors[slots])
         self._trained_on = len(slots)
         self._append(slots)
 
     def _append(self, slots: NDArray[np.int64]) -> None:
         first = self._rows
-        self._faiss.add(self._table.vectors[slots])
+        self._built.add(self._table.vectors[slots])
         if self._rows > len(self._slots):
             self._slots = np.concatenate([self._slots, np.zeros(self._rows, np.int64)])
         self._slots[first : self._rows] = slots
@@ -176,20 +175,19 @@ class FaissIndex:
         del self._place[slot]
 
     def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        import faiss
-
+        faiss = _faiss()
         rows = np.flatnonzero(allowed)
-        if self._faiss is None or len(rows) <= max(1000, 20 * k):
+        if self._built is None or len(rows) <= max(1000, 20 * k):
             return _best(self._table, rows, query, k)
         mask = np.zeros(self._rows, np.bool_)
         mask[np.fromiter((self._place[s] for s in rows.tolist()), np.int64, len(rows))] = True
         bits = np.packbits(mask, bitorder="little")
         selector = faiss.IDSelectorBitmap(bits)
-        if hasattr(self._faiss, "hnsw"):
+        if hasattr(self._built, "hnsw"):
             parameters = faiss.SearchParametersHNSW(efSearch=max(1000, 20 * k), sel=selector)
         else:
-            parameters = faiss.SearchParametersIVF(nprobe=max(16, self._faiss.nlist // 2), sel=selector)
-        found = self._faiss.search(query[None], max(1000, 20 * k), params=parameters)[1][0]
+            parameters = faiss.SearchParametersIVF(nprobe=max(16, self._built.nlist // 2), sel=selector)
+        found = self._built.search(query[None], max(1000, 20 * k), params=parameters)[1][0]
         found = found[found >= 0]
         if len(found) < k:
             return _best(self._table, rows, query, k)
@@ -246,8 +244,7 @@ def make_index(name: str, table: VectorTable) -> VectorIndex:
 
 
 def _build_hnsw(rows: int, vectors: NDArray[np.float32]) -> Any:
-    import faiss
-
+    faiss = _faiss()
     index = faiss.IndexHNSWSQ(vectors.shape[1], faiss.ScalarQuantizer.QT_fp16, 32, faiss.METRIC_INNER_PRODUCT)
     index.hnsw.efConstruction = 80
     index.train(vectors[:1])
@@ -255,8 +252,7 @@ def _build_hnsw(rows: int, vectors: NDArray[np.float32]) -> Any:
 
 
 def _build_ivfpq(rows: int, vectors: NDArray[np.float32]) -> Any:
-    import faiss
-
+    faiss = _faiss()
     dim = vectors.shape[1]
     lists = max(16, int(np.sqrt(rows)))
     index = faiss.index_factory(dim, f"IVF{lists},PQ{dim // 2}x4fs", faiss.METRIC_INNER_PRODUCT)
@@ -264,13 +260,18 @@ def _build_ivfpq(rows: int, vectors: NDArray[np.float32]) -> Any:
     return index
 
 
+def _faiss() -> Any:
+    import faiss  # 0.1 s that exact search need not pay; its type stubs are incomplete
+
+    return faiss
+
+
 def _gaussian_codebook() -> NDArray[np.float32]:
     """(16, 2) k-means of the standard 2-D Gaussian: the grid of least error for 4-bit codes of pairs."""
-    import faiss
-
+    faiss = _faiss()
     kmeans = faiss.Kmeans(2, 16, niter=25, seed=1, max_points_per_centroid=10_000)
     kmeans.train(np.random.default_rng(1).standard_normal((20_000, 2), dtype=np.float32))
-    return kmeans.centroids
+    return cast(np.ndarray, kmeans.centroids)
 
 
 def _best(table: VectorTable, slots: NDArray[np.int64], query: NDArray[np.float32], k: int) -> NDArray[np.int64]:

@@ -29,7 +29,7 @@ from pnv_core.types import ImageRef, PlaceDescriptor
 
 MB = 1_000_000
 # Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
-OBJECT_BYTES = 1500
+OBJECT_BYTES = 2000
 
 _log = logging.getLogger(__name__)
 

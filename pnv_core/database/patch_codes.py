@@ -99,8 +99,8 @@ def buffer_bytes(layouts: tuple[GridLayout, ...]) -> int:
 def encode(grids: tuple[PatchGrid, ...], layouts: tuple[GridLayout, ...]) -> NDArray[np.uint8]:
     """The grids in one read-only buffer (buffer_bytes(layouts),) uint8."""
     buffer = np.zeros(buffer_bytes(layouts), np.uint8)
-    for grid, layout, view in zip(grids, layouts, views(buffer, layouts), strict=True):
-        if layout.precision == "int8":
+    for grid, view in zip(grids, views(buffer, layouts), strict=True):
+        if view.scales is not None:
             values = np.asarray(grid.descriptors, np.float32)
             scales = np.abs(values).max(axis=1) / np.float32(127)
             view.scales[:] = scales

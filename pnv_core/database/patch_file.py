@@ -58,7 +58,7 @@ class PatchFile:
         if place == self.end and self.end + nbytes > self._limit:
             return None
         try:
-            self._write_at(place, memoryview(buffer))
+            self._write_at(place, buffer.data)
         except OSError:
             if place != self.end:
                 free.append(place)
@@ -73,7 +73,7 @@ class PatchFile:
 
     def read(self, place: int, nbytes: int) -> NDArray[np.uint8]:
         buffer = np.empty(nbytes, np.uint8)
-        got = os.preadv(self._handle.fileno(), [buffer], place)
+        got = os.preadv(self._handle.fileno(), [buffer.data], place)
         if got != nbytes:
             raise OSError(f"patch file in {self.folder}: {got} of {nbytes} bytes at {place}")
         buffer.flags.writeable = False
