@@ -24,6 +24,8 @@ ROS = [
     "ros-jazzy-common-interfaces==5.3.6",  # message packages generated for the rclpy above
 ]
 
+DASK = ["distributed>=2024.1"]  # evaluation on several machines; lighter than Ray
+
 DEVELOPMENT = [
     "pytest>=8",
     "hypothesis>=6.100",

@@ -40,7 +40,7 @@ table{border-collapse:collapse;width:100%;font-size:.86rem;font-variant-numeric:
 th,td{padding:6px 10px;text-align:right;white-space:nowrap;border-bottom:1px solid var(--line)}
 tr:last-child td{border-bottom:0}
 th{background:var(--panel);font-weight:600}
-th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:var(--paper);max-width:46vw;
+th:first-child,td:first-child{text-align:left;position:sticky;left:0;background:var(--paper);min-width:9.5em;max-width:46vw;
 white-space:normal}
 th:first-child{background:var(--panel)}td small{color:var(--soft)}td b{color:#0a7d5c}
 @media(prefers-color-scheme:dark){td b{color:#4fd1a5}}
