@@ -88,6 +88,8 @@ class Config:
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
     match_mode: str = setting("exact", "exact, or coarse-to-fine matching of candidates", choices=("exact", "coarse"))
 
+    verify: int = setting(3, "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept", low=0, high=100)
+
     # Decision
     accept_score: float = setting(0.5, "least calibrated score of an accepted closure", low=0.0, high=1.0, live=True)
     min_texture: float = setting(0.05, "images with less texture than this close no loop", low=0.0, high=1.0, live=True)

@@ -23,10 +23,14 @@ class KeyframeSelector:
 
     def differs(self, frame: Frame, descriptor: PlaceDescriptor) -> bool:
         """Whether 1 - cosine to the camera's last keyframe is at least `min_change`."""
-        last = self._last.get(frame.camera)
-        if last is None or self.config.min_change == 0.0:
+        if frame.camera not in self._last or self.config.min_change == 0.0:
             return True
-        return 1.0 - float(last[1] @ descriptor.global_vector) >= self.config.min_change
+        return 1.0 - self.similarity(frame, descriptor) >= self.config.min_change
+
+    def similarity(self, frame: Frame, descriptor: PlaceDescriptor) -> float:
+        """Cosine to the camera's last keyframe; 1 before the first."""
+        last = self._last.get(frame.camera)
+        return 1.0 if last is None else float(last[1] @ descriptor.global_vector)
 
     def take(self, frame: Frame, descriptor: PlaceDescriptor) -> None:
         self._last[frame.camera] = frame.stamp_ns, descriptor.global_vector

@@ -1,13 +1,15 @@
 """PlaceRecognizer: one frame in, its loop-closure candidates out. Deterministic, no clock, no ROS."""
 
-from pnv_core.calibration import Evidence, Uncalibrated
+from dataclasses import replace
+
 from pnv_core.config import Config
 from pnv_core.database import KeyframeDatabase
 from pnv_core.describer import Describer
+from pnv_core.judging import Judge
 from pnv_core.keyframes import KeyframeSelector
-from pnv_core.reranker import Reranker
+from pnv_core.local_features import thumbnail
 from pnv_core.timing import StageTimer
-from pnv_core.types import Frame, ImageRef, LoopClosure, PlaceDescriptor, Reason
+from pnv_core.types import Frame, ImageRef, LoopClosure, Reason
 
 
 class PlaceRecognizer:
@@ -28,8 +30,7 @@ class PlaceRecognizer:
         self.database = database or KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
         self.timer = timer or StageTimer()
         self.keyframes = KeyframeSelector(config)
-        self.reranker = Reranker(describer.config)
-        self.calibration = Uncalibrated()
+        self.judge = Judge(describer.config, describer.model.info.calibration)
 
     def process(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate examined for the frame, best first, accepted or refused with a reason.
@@ -42,19 +43,24 @@ class PlaceRecognizer:
             descriptor = self.describer.describe(frame.rgb, frame.valid)
         if not self.keyframes.differs(frame, descriptor):
             return []
+        predecessor = self.keyframes.similarity(frame, descriptor)
         self.keyframes.take(frame, descriptor)
+        if self.config.verify:
+            descriptor = replace(descriptor, thumbnail=thumbnail(frame.rgb))
+            self.judge.verifier.mask(frame.camera, frame.valid)
         with self.timer.stage("retrieve"):
+            recent_ns = int(self.config.exclude_recent_s * 1e9)
             candidates = self.database.nearest(
-                descriptor.global_vector, self.config.candidates, frame.stamp_ns, int(self.config.exclude_recent_s * 1e9)
+                descriptor.global_vector, self.config.candidates, frame.stamp_ns, recent_ns
             )
         with self.timer.stage("rerank"):
-            references = [(ref, similarity, self.database.descriptor(ref.id)) for ref, similarity in candidates]
+            known = [(ref, similarity, self.database.descriptor(ref.id)) for ref, similarity in candidates]
             query = ImageRef(-1, frame.stamp_ns, frame.camera)
-            closures = [self._examined(query, descriptor, *reference) for reference in references]
+            closures = self.judge.judged(query, descriptor, predecessor, known, self.config.verify)
         with self.timer.stage("store"):
             query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
-        ranked = sorted(closures, key=lambda c: (-c.score, -c.similarity, c.match.id))
-        return [self._decided(query, descriptor, c) for c in ranked]
+        decided = [self._decided(replace(c, query=query)) for c in closures]
+        return sorted(decided, key=lambda c: -c.score)
 
     def change(self, config: Config) -> None:
         """Take the live settings of another Config, from the next frame on."""
@@ -70,19 +76,9 @@ class PlaceRecognizer:
         self.database.clear()
         self.keyframes.forget()
 
-    def _examined(self, query: ImageRef, descriptor: PlaceDescriptor, ref: ImageRef, similarity: float, reference: PlaceDescriptor) -> LoopClosure:
-        spatial = self.reranker.score(descriptor, reference)
-        score = self.calibration.probability(Evidence(similarity, spatial.score, spatial.inliers))
-        return LoopClosure(query, ref, score, similarity, spatial.score, spatial.inliers, False, matches=spatial.matches)
-
-    def _decided(self, query: ImageRef, descriptor: PlaceDescriptor, closure: LoopClosure) -> LoopClosure:
-        if descriptor.texture < self.config.min_texture:
-            reason = Reason.LOW_TEXTURE
-        elif closure.score < self.config.accept_score:
-            reason = Reason.LOW_SCORE
-        else:
-            reason = Reason.ACCEPTED
-        return LoopClosure(
-            query, closure.match, closure.score, closure.similarity, closure.spatial, closure.inliers,
-            reason is Reason.ACCEPTED, reason, closure.matches,
-        )
+    def _decided(self, closure: LoopClosure) -> LoopClosure:
+        if closure.evidence.texture < self.config.min_texture:
+            return replace(closure, score=0.0, reason=Reason.LOW_TEXTURE)
+        if closure.score < self.config.accept_score:
+            return replace(closure, reason=Reason.LOW_SCORE)
+        return replace(closure, accepted=True)

@@ -51,11 +51,13 @@ class PlaceDescriptor:
     """What is remembered of an image: a unit global vector (D,) float32 and one PatchGrid per patch size.
 
     `texture` in [0, 1] is the share of the image that is not blank; it gates meaningless matches.
+    `thumbnail` is a small grey JPEG for local features, empty where none is kept.
     """
 
     global_vector: NDArray[np.float32]
     patches: tuple[PatchGrid, ...]
     texture: float = 1.0
+    thumbnail: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,27 @@ class Reason(StrEnum):
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """What is known of a candidate before the decision.
+
+    Leads are differences, positive where the candidate stands out; "elsewhere" is every candidate that is no neighbour
+    of this one. Spreads are areas of convex hulls of inliers as a share of the image, the smaller of both images.
+    """
+
+    similarity: float  # cosine of the global vectors
+    spatial: float  # fused spatial score in [0, 1]
+    inliers: int  # RANSAC inliers over all patch sizes (mutual matches for the rapid scorer)
+    spread: float = 0.0  # of the patch inliers, in [0, 1]
+    distortion: float = 0.0  # Frobenius distance of the affine map between the patch inliers from the identity
+    lead: float = 0.0  # of similarity over the best candidate elsewhere
+    recent_lead: float = 0.0  # of similarity over that of the query's predecessor to the query
+    spatial_lead: float = 0.0  # of the spatial score over the best candidate elsewhere
+    texture: float = 1.0  # the lesser of both images, in [0, 1]
+    local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined
+    local_spread: float = 0.0  # of those
+
+
+@dataclass(frozen=True)
 class LoopClosure:
     """A candidate examined for a query: accepted, or refused with a reason.
 
@@ -116,3 +139,4 @@ class LoopClosure:
     accepted: bool
     reason: Reason = Reason.ACCEPTED
     matches: tuple[PatchMatches, ...] = field(default=(), compare=False, repr=False)
+    evidence: Evidence | None = field(default=None, compare=False, repr=False)

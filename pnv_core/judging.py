@@ -1,0 +1,115 @@
+"""What speaks for each candidate, weighed: patches first, then local features of the best ones, then P(same place)."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pnv_core.calibration import Calibration, calibration_for
+from pnv_core.config import Config
+from pnv_core.local_features import Verifier, hull_area
+from pnv_core.reranker import Reranker, SpatialResult
+from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor
+
+_NEIGHBOURS = 10  # keyframes this close in number show one place
+_WORTH_A_LOOK = 0.01  # a candidate below this score is not examined further
+
+Candidate = tuple[ImageRef, float, PlaceDescriptor]  # keyframe, similarity, descriptor
+
+
+class Judge:
+    """Scores the candidates of a query with the re-ranker and calibration of a completed Config."""
+
+    def __init__(self, config: Config, stored_calibration: dict | None) -> None:
+        self.reranker = Reranker(config)
+        self.verifier = Verifier()
+        self.calibration: Calibration = calibration_for(stored_calibration, config)
+
+    def judged(
+        self,
+        query: ImageRef,
+        descriptor: PlaceDescriptor,
+        predecessor: float,
+        candidates: Sequence[Candidate],
+        verify: int,
+    ) -> list[LoopClosure]:
+        """A LoopClosure per candidate, best first, none accepted yet.
+
+        `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the `verify` best
+        candidates are examined by local features where both images have a thumbnail.
+        """
+        results = [self.reranker.score(descriptor, reference) for _, _, reference in candidates]
+        found = []
+        for number, ((ref, similarity, reference), result) in enumerate(zip(candidates, results, strict=True)):
+            elsewhere = [i for i, (other, _, _) in enumerate(candidates) if _apart(other, ref)]
+            evidence = Evidence(
+                similarity=similarity,
+                spatial=result.score,
+                inliers=result.inliers,
+                spread=spread(descriptor, reference, result.matches),
+                distortion=distortion(descriptor, reference, result.matches),
+                lead=min((similarity - candidates[i][1] for i in elsewhere), default=0.0),
+                recent_lead=similarity - predecessor,
+                spatial_lead=min((result.score - results[i].score for i in elsewhere), default=0.0),
+                texture=min(descriptor.texture, reference.texture),
+            )
+            found.append((self._closure(query, ref, evidence, result), number))
+        found.sort(key=lambda pair: _rank(pair[0]))
+        for place, (closure, number) in enumerate(found[:verify]):
+            picture = candidates[number][2].thumbnail
+            if descriptor.thumbnail and picture and closure.score >= _WORTH_A_LOOK:
+                check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
+                seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
+                found[place] = self._closure(query, closure.match, seen, results[number]), number
+        return sorted((closure for closure, _ in found), key=_rank)
+
+    def _closure(self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult) -> LoopClosure:
+        score = self.calibration.probability(evidence)
+        return LoopClosure(
+            query, match, score, evidence.similarity, result.score, result.inliers, False,
+            matches=result.matches, evidence=evidence,
+        )  # fmt: skip
+
+
+def _rank(closure: LoopClosure) -> tuple[float, float, int]:
+    return -closure.score, -closure.similarity, closure.match.id
+
+
+def _apart(a: ImageRef, b: ImageRef) -> bool:
+    return a.session != b.session or abs(a.id - b.id) > _NEIGHBOURS
+
+
+def _inlier_points(
+    query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2), (N, 2) pixels of the inliers of every patch size, pooled; all matches where none was tested."""
+    pairs = []
+    for q, r, m in zip(query.patches, reference.patches, matches, strict=True):
+        use = m.inlier if m.inlier.any() else np.ones(len(m.query), bool)
+        pairs.append((q.keypoints()[m.query[use]], r.keypoints()[m.reference[use]]))
+    return np.concatenate([p for p, _ in pairs]), np.concatenate([p for _, p in pairs])
+
+
+def spread(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
+    """Convex hull of the patch inliers as a share of what the patch centres span, the smaller of both images."""
+    q, r = _inlier_points(query, reference, matches)
+    centres = max(query.patches, key=lambda grid: len(grid.descriptors)).keypoints()
+    span = float(np.ptp(centres, axis=0).prod())
+    return min(hull_area(q), hull_area(r)) / span if span else 0.0
+
+
+def distortion(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
+    """How far the affine map from reference to query is from a shift: the Frobenius norm of its linear part less I.
+
+    A robot back at a place sees it little rotated and scaled; chance matches shrink to a point, mirror or shear.
+    Infinite for fewer than three inliers or inliers on a line.
+    """
+    q, r = _inlier_points(query, reference, matches)
+    if len(q) < 3:
+        return float("inf")
+    centred = r - r.mean(0)
+    scatter = centred.T @ centred
+    if np.linalg.cond(scatter) > 1e8:
+        return float("inf")
+    linear = np.linalg.solve(scatter, centred.T @ (q - q.mean(0)))
+    return float(np.linalg.norm(linear - np.eye(2)))
