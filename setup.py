@@ -13,6 +13,8 @@ REQUIRED = [
     "faiss-cpu>=1.8",
     "safetensors>=0.4",
     "scipy>=1.11",
+    "numba>=0.60",  # compiled inner loops; the code runs without it, slower
+    "threadpoolctl>=3",
     "tqdm>=4.60",
     "rosbags>=0.10",  # rosbag2 in sqlite3 and mcap without a ROS installation
 ]

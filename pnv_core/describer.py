@@ -9,11 +9,13 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from pnv_core import kernels
 from pnv_core.checkpoints import load_checkpoint
 from pnv_core.config import Config
 from pnv_core.errors import ConfigError, ImageError
 from pnv_core.model_files import Model, load_model
-from pnv_core.patches import patch_descriptors
+from pnv_core.parallel import workers
+from pnv_core.patches import PatchAggregator, patch_descriptors
 from pnv_core.trunks import CELL
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.weights import resolve_weights
@@ -53,10 +55,19 @@ class Describer:
         for module in (model.trunk, model.netvlad, model.global_projection, model.patch_projection):
             if module is not None:
                 module.to(self.device)
-        model.trunk.to(memory_format=torch.channels_last)
+        model.trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
+        self.aggregator = self._aggregator()
         self.fingerprint = model.fingerprint()
+
+    def _aggregator(self) -> PatchAggregator | None:
+        """None where the plain formulation on the device serves instead."""
+        if self.device.type != "cpu" or not kernels.COMPILED:
+            return None
+        projection = self.model.patches_projection
+        pool = workers(self.config.threads)
+        return PatchAggregator(self.model.netvlad.centroids, projection.weight, projection.bias, pool)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -82,27 +93,25 @@ class Describer:
             if valid is not None:
                 weights = weights * torch.from_numpy(_valid_cells(valid, features.shape[-2:])).to(weights)
             vector = self.model.global_projection(self.model.netvlad.vlad(x, weights))[0]
-            projection = self.model.patches_projection
-            arrays = patch_descriptors(
-                x[0],
-                weights[0],
-                self.model.netvlad.centroids,
-                projection.weight,
-                projection.bias,
-                (features.shape[-2], features.shape[-1]),
-                self.config.patch_sizes,
-                self.config.patch_strides,
-            )
+            arrays = self._patches(x[0], weights[0], (features.shape[-2], features.shape[-1]))
             patches = tuple(
-                PatchGrid(size, rows, cols, array.cpu().numpy(), stride)
+                PatchGrid(size, rows, cols, array, stride)
                 for array, (size, stride, rows, cols) in zip(arrays, self.grids(), strict=True)
             )
             return PlaceDescriptor(vector.cpu().numpy(), patches, texture(pixels))
 
+    def _patches(self, x: torch.Tensor, weights: torch.Tensor, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
+        sizes, strides = self.config.patch_sizes, self.config.patch_strides
+        if self.aggregator is not None:
+            return self.aggregator(x, weights, shape, sizes, strides)
+        projection, centroids = self.model.patches_projection, self.model.netvlad.centroids
+        arrays = patch_descriptors(x, weights, centroids, projection.weight, projection.bias, shape, sizes, strides)
+        return [array.cpu().numpy() for array in arrays]
+
     def features(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
         """(H, W, 3) uint8 of the configured size -> feature map (1, C, h, w)."""
         images = torch.from_numpy(pixels).to(self.device).permute(2, 0, 1)[None].float() / 255.0
-        return self.model.trunk(images.contiguous(memory_format=torch.channels_last)).float()  # type: ignore[no-any-return]
+        return self.model.trunk(images.contiguous(memory_format=torch.channels_last)).float()
 
 
 def checked_image(rgb: Any) -> NDArray[np.uint8]:
@@ -153,7 +162,8 @@ def _completed(config: Config, model: Model) -> Config:
     cells = min(width, height) // CELL
     if max(sizes) > cells:
         raise ConfigError(
-            f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // CELL}x{height // CELL} cells; allowed: 1 to {cells}"
+            f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // CELL}x{height // CELL} cells; "
+            f"allowed: 1 to {cells}"
         )
     return done
 

@@ -1,11 +1,14 @@
 """Re-ranking: the spatial score of a query against a candidate, fused over patch sizes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from pnv_core.config import Config
 from pnv_core.matching import mutual_nearest
+from pnv_core.parallel import workers
 from pnv_core.spatial import fused_score, ransac_score, rapid_spatial_score
 from pnv_core.types import PatchMatches, PlaceDescriptor
 
@@ -29,6 +32,11 @@ class Reranker:
     def __init__(self, config: Config) -> None:
         self.scorer = config.scorer
         self.weights = config.patch_weights
+        self.workers = workers(config.threads)
+
+    def scores(self, query: PlaceDescriptor, references: Sequence[PlaceDescriptor]) -> list[SpatialResult]:
+        """`score` of every reference, in their order, in the threads of the Config."""
+        return self.workers.map(partial(self.score, query), references)
 
     def score(self, query: PlaceDescriptor, reference: PlaceDescriptor) -> SpatialResult:
         """Both descriptors come from one describer: equal patch sizes in equal order."""
