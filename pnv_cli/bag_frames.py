@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +54,7 @@ def unpacked(
         reader.open()
     except (AnyReaderError, OSError, ValueError) as error:
         raise PnvError(f"{bag}: cannot be read as a rosbag2 ({error})") from None
-    with reader:
+    with closing(reader):
         images = _one_topic(reader.connections, IMAGE_TYPES, image_topic, bag, "image")
         poses = _one_topic(reader.connections, _POSE_TYPES, pose_topic, bag, "pose")
         times, values = [], []

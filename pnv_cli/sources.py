@@ -3,6 +3,7 @@
 import csv
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,7 +113,7 @@ def bag(folder: str, topic: str | None) -> FrameSource:
         raise PnvError(f"{folder}: no images on {topic or 'any topic'}; image topics in the bag: {topics}")
 
     def frames() -> Iterator[tuple[str, Frame]]:
-        with reader:
+        with closing(reader):
             for number, (connection, _, raw) in enumerate(reader.messages(chosen)):
                 try:
                     yield str(number), message_to_frame(reader.deserialize(raw, connection.msgtype), connection.topic)

@@ -9,6 +9,7 @@ from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pnv_cli.bag_frames import unpacked
+from pnv_cli.main import main
 from pnv_core.errors import PnvError
 from pnv_core.evaluation.datasets import SequenceRule
 from pnv_core.evaluation.datasets.sequences import poses_csv
@@ -72,3 +73,12 @@ def test_a_bag_without_the_topic_names_those_it_has(bag: Path, tmp_path: Path) -
         unpacked(bag, tmp_path, "/front", None, 1.0, silent)
     with pytest.raises(PnvError, match="no such bag"):
         unpacked(tmp_path / "none", tmp_path, None, None, 1.0, silent)
+
+
+def test_pnv_run_reads_a_bag(bag: Path, tmp_path: Path) -> None:
+    small = ["--image-width", "160", "--image-height", "112", "--patch-sizes", "2", "--min-interval-s", "0"]
+    assert (
+        main(["run", "--bag", str(bag), "--csv", str(tmp_path / "out.csv"), "--all", "--exclude-recent-s", "2", *small])
+        == 0
+    )
+    assert (tmp_path / "out.csv").read_text().count("\n") > 1
