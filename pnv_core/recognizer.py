@@ -27,7 +27,9 @@ class PlaceRecognizer:
     ) -> None:
         self.config = config
         self.describer = describer
-        self.database = database or KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
+        if database is None:  # an empty one is false
+            database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
+        self.database = database
         self.timer = timer or StageTimer()
         self.keyframes = KeyframeSelector(config)
         self.judge = Judge(describer.config, describer.model.info.calibration)
@@ -58,7 +60,8 @@ class PlaceRecognizer:
             query = ImageRef(-1, frame.stamp_ns, frame.camera)
             closures = self.judge.judged(query, descriptor, predecessor, known, self.config.verify)
         with self.timer.stage("store"):
-            query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
+            if not self.database.read_only:
+                query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
         decided = [self._decided(replace(c, query=query)) for c in closures]
         return sorted(decided, key=lambda c: -c.score)
 
