@@ -92,8 +92,9 @@ def image_to_rgb(message: Any) -> NDArray[np.uint8]:
         raise ImageError(f"image of encoding {message.encoding} is {width} wide; allowed: an even width")
     row = width * encoding.channels * np.dtype(encoding.dtype).itemsize
     if step < row:
-        raise ImageError(f"image step {step} is smaller than a row; allowed: at least {row} for {width} pixels "
-                         f"of {message.encoding}")
+        raise ImageError(
+            f"image step {step} is smaller than a row; allowed: at least {row} for {width} pixels of {message.encoding}"
+        )
     data = _bytes_of(message.data)
     if data.size < step * height:
         raise ImageError(f"image data has {data.size} bytes; allowed: at least step * height = {step * height}")
@@ -118,8 +119,10 @@ def compressed_to_rgb(message: Any) -> NDArray[np.uint8]:
     elif head.startswith(b"\x89PNG\r\n\x1a\n"):
         kind, size = "png", _png_size(data.tobytes())
     else:
-        raise ImageError(f"compressed image of format {message.format!r} starts with {head[:8].hex(' ') or 'nothing'}; "
-                         "allowed: jpeg, png")
+        raise ImageError(
+            f"compressed image of format {message.format!r} starts with {head[:8].hex(' ') or 'nothing'}; "
+            "allowed: jpeg, png"
+        )
     _check_size(*size)
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
@@ -146,8 +149,9 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
 
 def _check_size(width: int, height: int) -> None:
     if not (MIN_SIDE <= width <= MAX_SIDE and MIN_SIDE <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
-        raise ImageError(f"image is {width}x{height} pixels; allowed: sides of {MIN_SIDE} to {MAX_SIDE}, "
-                         f"at most {MAX_PIXELS} pixels")
+        raise ImageError(
+            f"image is {width}x{height} pixels; allowed: sides of {MIN_SIDE} to {MAX_SIDE}, at most {MAX_PIXELS} pixels"
+        )
 
 
 def _png_size(data: bytes) -> tuple[int, int]:

@@ -12,7 +12,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.slot import NewestFrames, WaitingFrame
-from pnv_ros.stamps import StampRule, StampVerdict
+from pnv_ros.stamps import StampRule, StampVerdict, in_seconds
 from pnv_ros.statistics import Drop, Statistics
 
 OVERRIDABLE = (
@@ -54,6 +54,7 @@ class ImageInputs:
         self.paused = False
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
+        self._mismatches: dict[str, str] = {}  # topic: policy
         for topic in config.image_topics:
             self._subscribe(topic, self._expected_type(topic))
 
@@ -135,7 +136,7 @@ class ImageInputs:
     def _tell(self, topic: str, verdict: StampVerdict, stamp_ns: int, back_ns: int) -> None:
         """Once per topic and kind; every new session is worth a line."""
         log = self._node.get_logger()
-        stamp, back = f"{stamp_ns / 1e9:.9f}", f"{back_ns / 1e9:.3f} s"
+        stamp, back = in_seconds(stamp_ns), f"{back_ns / 1e9:.3f} s"
         if verdict is StampVerdict.NEW_SESSION:
             log.info(f"stamps of {topic} went back by {back} to {stamp}: a new session begins (on_stamp_back)")
         elif (topic, verdict) not in self._told:
@@ -149,22 +150,26 @@ class ImageInputs:
                 )
 
     def _incompatible(self, topic: str) -> Callable[[Any], None]:
-        def report(info: Any) -> None:
-            subscription = self._subscriptions.get(topic)
-            if subscription is None:
-                return
-            policy = qos_policy_name_from_kind(info.last_policy_kind).lower()
+        def note(info: Any) -> None:
+            self._mismatches[topic] = qos_policy_name_from_kind(info.last_policy_kind).lower()
+
+        return note
+
+    def report_mismatches(self) -> None:
+        """Say which publishers cannot be heard and what to change. Called a little after the event, since the
+        publisher's name is discovered after its profile."""
+        for topic, policy in self._mismatches.items():
+            subscription = self._subscriptions[topic]
             name, ours = subscription.topic_name, qos_in_words(subscription.qos_profile)
             for publisher in self._publishers(topic):
                 theirs = qos_in_words(publisher.qos_profile)
                 if theirs != ours:
-                    offered = getattr(publisher.qos_profile, policy, None)
                     self._node.get_logger().warning(
                         f"no images from {publisher.node_name} on {name}: it offers {theirs}, "
-                        f"this node asks for {ours}; set qos_overrides.{name}.subscription.{policy} to {_word(offered)}"
+                        f"this node asks for {ours}; set qos_overrides.{name}.subscription.{policy} to "
+                        f"{_word(getattr(publisher.qos_profile, policy))}"
                     )
-
-        return report
+        self._mismatches.clear()
 
 
 def qos_in_words(profile: QoSProfile) -> str:
@@ -174,5 +179,3 @@ def qos_in_words(profile: QoSProfile) -> str:
 
 def _word(policy: Any) -> str:
     return getattr(policy, "name", str(policy)).lower().replace("_", " ")
-
-

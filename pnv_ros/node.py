@@ -30,7 +30,6 @@ from pnv_ros.services import create_services
 from pnv_ros.slot import NewestFrames
 from pnv_ros.stamps import StampRule
 from pnv_ros.statistics import Statistics
-from pnv_ros.thumbnails import Thumbnails
 from pnv_ros.view import View, read_mask
 from pnv_ros.worker import Worker
 
@@ -166,9 +165,7 @@ class PlaceRecognizerNode(LifecycleNode):
         database = KeyframeDatabase.from_config(
             describer.config, describer.model.global_dim, read_only=config.read_only
         )
-        recognizer = PlaceRecognizer(
-            self.settings.recogniser, describer, database, timer=StageTimer(time.perf_counter)
-        )
+        recognizer = PlaceRecognizer(self.settings.recogniser, describer, database, timer=StageTimer(time.perf_counter))
         per_keyframe = database.bytes_per_keyframe(_warm_up(describer))
         if per_keyframe > database.bytes_budget:
             raise ConfigError(
@@ -177,9 +174,7 @@ class PlaceRecognizerNode(LifecycleNode):
             )
         self._stamps = StampRule(config.on_stamp_back)
         outputs = Outputs(self, config, describer.image_size)
-        self._recognition = Recognition(
-            recognizer, views, outputs, Thumbnails(config.thumbnails_mb), self._statistics, self.get_logger()
-        )
+        self._recognition = Recognition(recognizer, views, outputs, self._statistics, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
         self._infos = [
             self.create_subscription(CameraInfo, topic, self._rectify(views[camera], camera), 1)
@@ -244,6 +239,7 @@ class PlaceRecognizerNode(LifecycleNode):
         if recognition is None or inputs is None or diagnostics is None:
             return
         inputs.follow_types()
+        inputs.report_mismatches()
         diagnostics.look(self.settings, inputs)
         recognition.outputs.markers.publish(recognition.recognizer.database.refs(), self.settings.node)
 

@@ -61,9 +61,6 @@ class NodeConfig:
         30.0, "least time between query and match of ~/lio_sam", unit="s", low=0.0, high=1e6, live=True
     )
     frame_id: str = setting("map", "frame of ~/markers where poses name none", live=True)
-    thumbnails_mb: float = setting(
-        32.0, "memory for small keyframe pictures, shown in ~/match_image; 0 = none", unit="MB", low=0.0, high=1e5
-    )
 
     def __post_init__(self) -> None:
         checked(self)

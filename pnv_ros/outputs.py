@@ -1,7 +1,8 @@
 """What the node publishes of each query, and when."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -15,7 +16,6 @@ from pnv_core.drawing import draw_match
 from pnv_core.types import Frame, LoopClosure
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
-from pnv_ros.thumbnails import Thumbnails
 
 CLOSURES_QOS = QoSProfile(
     depth=50, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
@@ -45,8 +45,11 @@ class Outputs:
     def new_session(self) -> None:
         self._last_lio_sam_ns = None
 
-    def publish(self, frame: Frame, closures: Sequence[LoopClosure], thumbnails: Thumbnails) -> None:
-        """Everything there is to say about one query; `closures` best first, refused ones too, not empty."""
+    def publish(self, frame: Frame, closures: Sequence[LoopClosure], picture_of: Callable[[int], bytes]) -> None:
+        """Everything there is to say about one query; `closures` best first, refused ones too, not empty.
+
+        `picture_of` gives the small JPEG of a keyframe, empty where none is kept.
+        """
         accepted = [c for c in closures if c.accepted]
         if accepted:
             self._closures.publish(closures_to_message(accepted, self._cameras))
@@ -55,7 +58,7 @@ class Outputs:
         if self.config.publish_candidates and self._candidates.get_subscription_count():
             self._candidates.publish(candidates_to_message(closures, self._cameras, self.config.frame_id))
         if self.config.publish_match_image and self._match_image.get_subscription_count():
-            self._match_image.publish(self._picture(frame, closures[0], thumbnails))
+            self._match_image.publish(self._picture(frame, closures[0], picture_of(closures[0].match.id)))
 
     def _publish_lio_sam(self, accepted: Sequence[LoopClosure]) -> None:
         """The best closure old enough for LIO-SAM, which takes no loops within its own window."""
@@ -70,15 +73,13 @@ class Outputs:
             self._lio_sam.publish(closure_to_lio_sam(best))
             self._last_lio_sam_ns = best.query.stamp_ns
 
-    def _picture(self, frame: Frame, closure: LoopClosure, thumbnails: Thumbnails) -> Image:
-        reference = thumbnails.get(closure.match.id)
-        if reference is None:
-            reference = _blank(self._size)
+    def _picture(self, frame: Frame, closure: LoopClosure, reference: bytes) -> Image:
         verdict = "accepted" if closure.accepted else f"refused: {closure.reason}"
         caption = f"score {closure.score:.3f}, {verdict}"
-        picture = draw_match(frame.rgb, reference, closure.matches, self._size, caption)
+        picture = draw_match(frame.rgb, self._unpacked(reference), closure.matches, self._size, caption)
         return rgb_to_message(picture, frame.stamp_ns, self.config.frame_id)
 
-
-def _blank(size: tuple[int, int]) -> NDArray[np.uint8]:
-    return np.full((size[1], size[0], 3), 64, np.uint8)
+    def _unpacked(self, picture: bytes) -> NDArray[np.uint8]:
+        if not picture:
+            return np.full((self._size[1], self._size[0], 3), 64, np.uint8)
+        return cv2.cvtColor(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2RGB)

@@ -14,8 +14,8 @@ from pnv_core.types import Frame, LoopClosure
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Settings
 from pnv_ros.slot import WaitingFrame
+from pnv_ros.stamps import in_seconds
 from pnv_ros.statistics import Drop, Statistics
-from pnv_ros.thumbnails import Thumbnails
 from pnv_ros.view import View
 
 _REPEAT_S = 10.0  # the same complaint is not made more often
@@ -29,12 +29,11 @@ class Recognition:
         recognizer: PlaceRecognizer,
         views: dict[str, View],
         outputs: Outputs,
-        thumbnails: Thumbnails,
         statistics: Statistics,
         log: Any,
     ) -> None:
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
-        self.thumbnails, self._statistics, self._log = thumbnails, statistics, log
+        self._statistics, self._log = statistics, log
         self._session = 0
         self._still = threading.Lock()
         self._sizes: dict[str, tuple[int, int]] = {}
@@ -55,14 +54,12 @@ class Recognition:
         with self._still:
             count = len(self.recognizer.database)
             self.recognizer.reset()
-            self.thumbnails.clear()
             self.outputs.markers.forget()
             return count
 
     def map_was_replaced(self) -> None:
         """A map was loaded, which began a session. To be called while still."""
         self.recognizer.keyframes.forget()
-        self.thumbnails.clear()
         self.outputs.new_session()
         self.outputs.markers.forget()
 
@@ -80,20 +77,19 @@ class Recognition:
                 return
             try:
                 frame = self._unpacked(waiting)
-                newest = self.recognizer.database.last()
                 closures = self.recognizer.process(frame)
             except ImageError as error:
                 count = self._statistics.drop(Drop.UNUSABLE)
                 self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
                 return
-            added = self.recognizer.database.last()
-            if added is not None and added != newest:
-                self.thumbnails.add(added.id, frame.rgb)
             if closures:
                 with self.recognizer.timer.stage("publish"):
-                    self.outputs.publish(frame, closures, self.thumbnails)
+                    self.outputs.publish(frame, closures, self._picture_of)
         accepted = sum(c.accepted for c in closures)
         self._statistics.process(closures[0].score if closures else None, accepted, _in_words(closures))
+
+    def _picture_of(self, keyframe: int) -> bytes:
+        return self.recognizer.database.descriptor(keyframe).thumbnail
 
     def _unpacked(self, waiting: WaitingFrame) -> Frame:
         with self.recognizer.timer.stage("decode"):
@@ -122,6 +118,6 @@ def _in_words(closures: list[LoopClosure]) -> str:
         return ""
     best = closures[0]
     return (
-        f"{best.query.stamp_ns / 1e9:.3f} s ({best.query.camera}) matches {best.match.stamp_ns / 1e9:.3f} s "
+        f"{in_seconds(best.query.stamp_ns)} ({best.query.camera}) matches {in_seconds(best.match.stamp_ns)} "
         f"({best.match.camera}), score {best.score:.3f}"
     )

@@ -33,6 +33,7 @@ def create_services(node: Node, controls: Controls) -> None:
     node.create_service(Trigger, "~/save", lambda _, response: answer(response, controls.save))
     node.create_service(Trigger, "~/load", lambda _, response: answer(response, controls.load))
     node.create_service(Trigger, "~/reset", lambda _, response: answer(response, controls.reset))
+
     def pause(request: Any, response: Any) -> Any:
         return answer(response, lambda: controls.pause(request.data))
 

@@ -4,6 +4,11 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 
+def in_seconds(stamp_ns: int) -> str:
+    """Decimal seconds, exact to the nanosecond."""
+    return f"{stamp_ns // 1_000_000_000}.{stamp_ns % 1_000_000_000:09d}"
+
+
 class StampVerdict(Enum):
     """What becomes of a frame by its stamp."""
 
