@@ -31,6 +31,7 @@ _HEADER = struct.Struct("<4sIII")
 _RECORD = struct.Struct("<4sIqqiHHdQI")
 _CHECKED = slice(8, None)  # of a record's head: all after its own checksum
 _HEADER_MAGIC, _RECORD_MAGIC = b"PNVS", b"PNVK"
+_MOST_THUMBNAIL = 1 << 20  # bytes behind the patches; a picture of 320 pixels width takes about 2**14
 _MOST_HEADER = 16_000_000  # bytes; more is damage, not a header
 
 Layouts = tuple[GridLayout, ...]
@@ -235,7 +236,7 @@ def _parse(head: bytes, header: SegmentHeader) -> _Head | None:
     whole = magic == _RECORD_MAGIC and crc == zlib.crc32(head[_CHECKED])
     if not whole or camera >= len(header.cameras) or layout >= len(header.layouts):
         return None
-    if nbytes != header.record_bytes(layout):
+    if not 0 <= nbytes - header.record_bytes(layout) <= _MOST_THUMBNAIL:
         return None
     ref = ImageRef(keyframe, stamp, header.cameras[camera], session)
     return _Head(ref, layout, texture, nbytes, payload_crc)
