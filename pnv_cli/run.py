@@ -6,6 +6,8 @@ import io
 import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
@@ -17,6 +19,9 @@ from pnv_core.files import atomic_write
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.timing import StageTimer
 from pnv_core.types import LoopClosure
+
+if TYPE_CHECKING:
+    from pnv_core.evaluation.run_report import RunRecorder
 
 COLUMNS = (
     "query",
@@ -43,6 +48,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
     parser.add_argument("--csv", required=True, metavar="OUT.csv", help="one row per accepted closure")
     parser.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
+    parser.add_argument("--report", metavar="FILE.html", help="scores, pictures and path of the run as one page")
+    parser.add_argument("--poses", metavar="CSV", help="positions for the report: columns timestamp,x,y,z")
     parser.add_argument("--timing", action="store_true", help="print the time of each stage")
     add_config_flags(parser)
     parser.set_defaults(run=run)
@@ -50,10 +57,14 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     output = writable(args.csv)
+    report = writable(args.report) if args.report else None
+    if args.poses and not report:
+        raise ConfigError("--poses is shown in the report; allowed: together with --report FILE.html")
     config = config_from(args)
     source = _source(args)
     timer = StageTimer(time.perf_counter)
     recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
+    recorder = _recorder(recognizer) if report else None
     names: dict[int, str] = {}  # by stamp
     rows: list[dict] = []
     done = 0
@@ -62,18 +73,40 @@ def run(args: argparse.Namespace) -> int:
             source.frames, total=source.count or None, unit="frame", disable=not sys.stderr.isatty()
         ):
             names[frame.stamp_ns] = name
-            rows += [_row(c, names) for c in _reported(recognizer.process(frame), args.all)]
+            closures = recognizer.process(frame)
+            rows += [_row(c, names) for c in _reported(closures, args.all)]
+            if recorder:
+                recorder.add(name, frame, closures)
             done += 1
     finally:  # an interrupted run keeps what it found
         _write(output, rows)
     if not done:
         raise PnvError("no frame of the input could be read")
+    if recorder and report:
+        _write_report(report, recorder, args, names)
     accepted = sum(row["accepted"] for row in rows)
     print(f"{done} frames, {len(recognizer.database)} keyframes, {accepted} closures -> {output}")
     if args.timing:
         for stage, (median, late) in timer.summary_ms().items():
             print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms")
     return 0
+
+
+def _recorder(recognizer: PlaceRecognizer) -> "RunRecorder":
+    from pnv_core.evaluation.run_report import RunRecorder
+
+    return RunRecorder(recognizer.describer.image_size)
+
+
+def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespace, names: dict[int, str]) -> None:
+    from pnv_core.evaluation.run_report import read_positions
+
+    positions = read_positions(Path(args.poses), list(names)) if args.poses else None
+    taken = Path(args.images or args.video or args.bag).name
+    with atomic_write(target) as file:
+        file.write(recorder.html([("Input", taken)], positions).encode())
+    recorder.close()
+    print(f"report: {target}")
 
 
 def _source(args: argparse.Namespace) -> FrameSource:

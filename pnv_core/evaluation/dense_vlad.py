@@ -7,18 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
 
 from pnv_core.config import Config
+from pnv_core.describer import resized
 from pnv_core.evaluation.extraction import Progress
 from pnv_core.evaluation.extractors import multiscale_vlad
 from pnv_core.evaluation.store import content_key
-from pnv_core.fit import FitOptions, fit_vocabulary, pca
+from pnv_core.fit import pca, spherical_kmeans
 from pnv_core.images import read_image
 from pnv_core.model_files import Model, ModelInfo, make_trunk, save_model
-from pnv_core.netvlad import Projection
+from pnv_core.netvlad import NetVLAD, Projection, alpha_rule
+from pnv_core.trunks import Trunk
 
 _IMAGES = 400  # evenly drawn from the references
 _CLUSTERS = 64
+_CELLS = 100  # drawn of each image for the vocabulary
 _DIMENSIONS = 512
 _PER_DIMENSION = 4  # images a principal direction is estimated from; with fewer, whitening blows up noise
 
@@ -35,12 +40,11 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
     trunk = make_trunk("rootsift", {})
-    options = FitOptions(clusters=_CLUSTERS, image_width=size[0], image_height=size[1])
 
     def shown(items: Iterable[Path], what: str) -> Iterable[Path]:
         return progress(items, len(files), f"DenseVLAD: {what}")
 
-    vocabulary = fit_vocabulary(trunk, files, options, shown)
+    vocabulary = _vocabulary(trunk, (resized(read_image(f), *size) for f in shown(files, "vocabulary")))
     info = ModelInfo("rootsift", image_width=size[0], image_height=size[1], patch_sizes=(2,), patch_weights=(1.0,))
     model = Model(info, trunk, vocabulary, Projection(_CLUSTERS * trunk.channels, 1))
     vlads = torch.stack([multiscale_vlad(model, read_image(f), size) for f in shown(files, "PCA")])
@@ -51,3 +55,19 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
         projection.load_state_dict({"weight": weight, "bias": bias})
     save_model(Model(info, trunk, vocabulary, projection), target)
     return target
+
+
+def _vocabulary(trunk: Trunk, images: Iterable[NDArray[np.uint8]]) -> NetVLAD:
+    """Clusters of local descriptors drawn from the images, with NetVLAD's assignment."""
+    generator = torch.Generator().manual_seed(0)
+    drawn = []
+    for image in images:
+        features = trunk(torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0)
+        cells = F.normalize(features[0].flatten(1).T, dim=1)
+        cells = cells[cells.any(1)]  # a cell without gradient has no descriptor
+        drawn.append(cells[torch.randperm(len(cells), generator=generator)[:_CELLS]])
+    samples = torch.cat(drawn)
+    centroids = spherical_kmeans(samples, _CLUSTERS, generator)
+    vocabulary = NetVLAD(_CLUSTERS, samples.shape[1])
+    vocabulary.load_state_dict({"centroids": centroids, "assignment": alpha_rule(centroids, samples)})
+    return vocabulary

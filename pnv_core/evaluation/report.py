@@ -5,6 +5,7 @@ import html
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -21,8 +22,8 @@ from pnv_core.images import read_image
 from pnv_core.types import PatchMatches
 
 RIGHT, WRONG, MISSED = "#009e73", "#d55e00", "#56b4e9"
-_GALLERY = 4  # pictures of each kind; bounds the file to a few megabytes
-_PICTURE = (320, 240)  # of each of the two images
+SHOWN = 4  # pictures of each kind; bounds the file to a few megabytes
+PICTURE_SIZE = (320, 240)  # of each of the two images
 _CURVE_DEPTH = 25
 _BINS = 24
 
@@ -56,6 +57,9 @@ figcaption{font-size:.8rem;color:var(--soft);margin-top:6px}
 """
 
 
+T = TypeVar("T")
+
+
 @dataclass(frozen=True)
 class Chapter:
     """The results of all methods on one data set."""
@@ -67,7 +71,7 @@ class Chapter:
 def evaluation_report(evaluation: Evaluation, chapters: Sequence[Chapter], about: Sequence[tuple[str, str]]) -> str:
     """The whole report as HTML. `about` are names and values for its head, such as the command and the machine."""
     every = [f for chapter in chapters for f in chapter.figures]
-    body = ["<h1>Place recognition report</h1>", _about(about), _summary(every)]
+    body = ["<h1>Place recognition report</h1>", about_lines(about), _summary(every)]
     for chapter in chapters:
         body.append(_chapter(evaluation, chapter))
     return page("Place recognition report", "".join(body))
@@ -82,7 +86,8 @@ def page(title: str, body: str) -> str:
     )
 
 
-def _about(about: Sequence[tuple[str, str]]) -> str:
+def about_lines(about: Sequence[tuple[str, str]]) -> str:
+    """Names and values at the head of a report."""
     return "".join(f"<p>{html.escape(name)}: <code>{html.escape(value)}</code></p>" for name, value in about)
 
 
@@ -208,7 +213,7 @@ def _matrix(evaluation: Evaluation, result: MethodResult) -> str:
     scale = max(1, 480 // max(coloured.shape[:2]))
     big = cv2.resize(coloured, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
     caption = f"Cosine of the global vectors, {low:.2f} (dark) to {high:.2f}; queries down, references across."
-    image = f'<img alt="similarity matrix" src="{_data_uri(big, ".png")}">'
+    image = f'<img alt="similarity matrix" src="{data_uri(big, ".png")}">'
     return f"<div><h3>Similarity matrix</h3><figure>{image}<figcaption>{caption}</figcaption></figure></div>"
 
 
@@ -222,7 +227,7 @@ def _trajectory(results: Sequence[MethodResult]) -> str:
     for q, ranking in enumerate(result.rankings):
         if len(ranking.references) and (len(dataset.truth[q]) or result.decisions.scores[q] > _largest_wrong(result)):
             links.append((q, int(ranking.references[0]), RIGHT if result.decisions.right[q] else WRONG))
-    flat = _flattened(dataset.query_positions)
+    flat = flattened(dataset.query_positions)
     return f"<div><h3>Path and best candidates of revisits</h3>{path_map(flat, links)}</div>"
 
 
@@ -231,7 +236,7 @@ def _largest_wrong(result: MethodResult) -> float:
     return float(wrong.max()) if len(wrong) else -math.inf
 
 
-def _flattened(positions: NDArray[np.float64]) -> list[tuple[float, float]]:
+def flattened(positions: NDArray[np.float64]) -> list[tuple[float, float]]:
     """(N, 3) -> the two axes along which the path extends most."""
     axes = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2])
     return [(float(p[axes[0]]), float(p[axes[1]])) for p in positions]
@@ -247,9 +252,9 @@ def _galleries(evaluation: Evaluation, result: MethodResult) -> str:
     missed = [q for q in by_score[::-1] if decisions.possible[q] and not decisions.right[q]]
     parts = [f"<h3>What {html.escape(result.method.label)} did</h3>"]
     for title, queries, colour in (
-        ("Right: from the most to the least certain", _spread(right), RIGHT),
-        ("Wrong: the most certain first", wrong[:_GALLERY], WRONG),
-        ("Missed: the query beside its best true reference", missed[:_GALLERY], MISSED),
+        ("Right: from the most to the least certain", spread(right), RIGHT),
+        ("Wrong: the most certain first", wrong[:SHOWN], WRONG),
+        ("Missed: the query beside its best true reference", missed[:SHOWN], MISSED),
     ):
         pictures = [_picture(evaluation, result, int(q), colour) for q in queries]
         empty = "" if pictures else "<p>None.</p>"
@@ -257,10 +262,11 @@ def _galleries(evaluation: Evaluation, result: MethodResult) -> str:
     return "".join(parts)
 
 
-def _spread(queries: Sequence[int]) -> list[int]:
-    if not queries:
+def spread(ranked: Sequence[T]) -> list[T]:
+    """A few of a ranked list, from its first to its last."""
+    if not ranked:
         return []
-    return [queries[i] for i in np.unique(np.linspace(0, len(queries) - 1, _GALLERY).round().astype(int))]
+    return [ranked[i] for i in np.unique(np.linspace(0, len(ranked) - 1, SHOWN).round().astype(int))]
 
 
 def _picture(evaluation: Evaluation, result: MethodResult, query: int, colour: str) -> str:
@@ -276,7 +282,7 @@ def _picture(evaluation: Evaluation, result: MethodResult, query: int, colour: s
     paths = dataset.queries[query], dataset.references[reference]
     images = [read_image(p) for p in paths]
     matches: tuple[PatchMatches, ...] = ()
-    size = _PICTURE
+    size = PICTURE_SIZE
     if method.features == "patchnetvlad" and method.scorer:
         completed = evaluation.completed(method.config(evaluation.config))
         features = evaluation.describing(dataset, method, "patchnetvlad")
@@ -287,18 +293,19 @@ def _picture(evaluation: Evaluation, result: MethodResult, query: int, colour: s
         size = completed.image_width, completed.image_height
     drawn = draw_match(images[0], images[1], matches, size, words)
     names = " ↔ ".join(html.escape(f"{p.parent.name}/{p.name}") for p in paths)
-    image = f'<img loading="lazy" alt="{names}" src="{_data_uri(_fitted(drawn))}">'
+    image = f'<img loading="lazy" alt="{names}" src="{data_uri(fitted(drawn))}">'
     return f'<figure style="border-left-color:{colour}">{image}<figcaption>{names}</figcaption></figure>'
 
 
-def _fitted(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def fitted(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """At most as wide as two pictures, as BGR."""
-    scale = min(1.0, 2 * _PICTURE[0] / rgb.shape[1])
+    scale = min(1.0, 2 * PICTURE_SIZE[0] / rgb.shape[1])
     small = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else rgb
     return cv2.cvtColor(small, cv2.COLOR_RGB2BGR).astype(np.uint8)
 
 
-def _data_uri(bgr: NDArray, suffix: str = ".jpg") -> str:
+def data_uri(bgr: NDArray, suffix: str = ".jpg") -> str:
+    """An image inside the page itself."""
     quality = [cv2.IMWRITE_JPEG_QUALITY, 80] if suffix == ".jpg" else []
     _, encoded = cv2.imencode(suffix, bgr, quality)
     kind = "jpeg" if suffix == ".jpg" else "png"

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from math import log10
 
 # Okabe and Ito's colours, then darker ones: told apart with any kind of colour vision.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555", "#8a6d00", "#5b3a8c", "#a01c40")
@@ -31,8 +32,6 @@ class Axis:
     def place(self, value: float, start: float, length: float) -> float:
         """Where a value lies on an axis from `start` over `length` pixels."""
         if self.log:
-            from math import log10
-
             share = (log10(max(value, self.low)) - log10(self.low)) / (log10(self.high) - log10(self.low))
         else:
             share = (value - self.low) / (self.high - self.low)
@@ -66,16 +65,18 @@ def line_chart(series: Sequence[Series], x: Axis, y: Axis) -> str:
     return _figure(body, x, y, legend([s.name for s in series]))
 
 
-def scatter(series: Sequence[Series], x: Axis, y: Axis) -> str:
+def scatter(series: Sequence[Series], x: Axis, y: Axis, colours: Sequence[str] | None = None, radius: float = 6) -> str:
     """One mark per series point, with a legend below."""
     body = []
+    fills = colours or [colour(i) for i in range(len(series))]
     for number, one in enumerate(series):
         for a, b in one.points:
             body.append(
-                f'<circle cx="{_x(x, a):.1f}" cy="{_y(y, b):.1f}" r="6" fill="{colour(number)}" fill-opacity=".85">'
+                f'<circle cx="{_x(x, a):.1f}" cy="{_y(y, b):.1f}" r="{radius}" fill="{fills[number]}"'
+                ' fill-opacity=".85">'
                 f"<title>{escape(one.name)}: {a:.4g}, {b:.4g}</title></circle>"
             )
-    return _figure(body, x, y, legend([s.name for s in series]))
+    return _figure(body, x, y, legend([s.name for s in series], fills))
 
 
 def histogram(groups: Sequence[tuple[str, Sequence[int]]], x: Axis, colours: Sequence[str]) -> str:
