@@ -8,14 +8,18 @@ spread never lower the score. It was fitted on pairs of known truth, so its outp
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from safetensors import safe_open
 from scipy.optimize import minimize
 
 from pnv_core.config import Config
 from pnv_core.errors import ModelError
+from pnv_core.model_files import load_model, save_model
 from pnv_core.types import Evidence
 
 Array = NDArray[np.float64]
@@ -115,6 +119,14 @@ def calibration_for(stored: dict[str, Any] | None, config: Config) -> Calibratio
         return CONSERVATIVE
     calibration = Calibration.from_json(stored)
     return calibration if calibration.suits(config) else CONSERVATIVE
+
+
+def write_calibration(path: Path | str, calibration: Calibration) -> None:
+    """Put the calibration into a model file, whole or not at all; the tensors and the fingerprint stay as they are."""
+    with safe_open(str(path), framework="pt") as file:
+        kept = {file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118 - no mapping
+    model = load_model(path).with_info(calibration=calibration.to_json())
+    save_model(model, path, dtype=kept.pop() if len(kept) == 1 else torch.float32)
 
 
 def fit_calibration(

@@ -31,12 +31,13 @@ class Judge:
         descriptor: PlaceDescriptor,
         predecessor: float,
         candidates: Sequence[Candidate],
-        verify: int,
+        config: Config,
     ) -> list[LoopClosure]:
         """A LoopClosure per candidate, best first, none accepted yet.
 
-        `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the `verify` best
-        candidates are examined by local features where both images have a thumbnail.
+        `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
+        `config.verify` best are examined by local features where both images have a thumbnail. An image with less
+        texture than `config.min_texture` scores 0.
         """
         results = [self.reranker.score(descriptor, reference) for _, _, reference in candidates]
         found = []
@@ -53,18 +54,20 @@ class Judge:
                 spatial_lead=min((result.score - results[i].score for i in elsewhere), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
             )
-            found.append((self._closure(query, ref, evidence, result), number))
+            found.append((self._closure(query, ref, evidence, result, config.min_texture), number))
         found.sort(key=lambda pair: _rank(pair[0]))
-        for place, (closure, number) in enumerate(found[:verify]):
+        for place, (closure, number) in enumerate(found[: config.verify]):
             picture = candidates[number][2].thumbnail
             if descriptor.thumbnail and picture and closure.score >= _WORTH_A_LOOK:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
                 seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
-                found[place] = self._closure(query, closure.match, seen, results[number]), number
+                found[place] = self._closure(query, closure.match, seen, results[number], config.min_texture), number
         return sorted((closure for closure, _ in found), key=_rank)
 
-    def _closure(self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult) -> LoopClosure:
-        score = self.calibration.probability(evidence)
+    def _closure(
+        self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float
+    ) -> LoopClosure:
+        score = self.calibration.probability(evidence) if evidence.texture >= min_texture else 0.0
         return LoopClosure(
             query, match, score, evidence.similarity, result.score, result.inliers, False,
             matches=result.matches, evidence=evidence,

@@ -3,11 +3,13 @@
 from dataclasses import replace
 
 from pnv_core.config import Config
+from pnv_core.consistency import SequenceMemory, confirmed, window_of
 from pnv_core.database import KeyframeDatabase
 from pnv_core.describer import Describer
 from pnv_core.judging import Judge
 from pnv_core.keyframes import KeyframeSelector
 from pnv_core.local_features import thumbnail
+from pnv_core.odometry import Odometry
 from pnv_core.timing import StageTimer
 from pnv_core.types import Frame, ImageRef, LoopClosure, Reason
 
@@ -33,6 +35,8 @@ class PlaceRecognizer:
         self.timer = timer or StageTimer()
         self.keyframes = KeyframeSelector(config)
         self.judge = Judge(describer.config, describer.model.info.calibration)
+        self.sequence = SequenceMemory()
+        self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
 
     def process(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate examined for the frame, best first, accepted or refused with a reason.
@@ -58,12 +62,14 @@ class PlaceRecognizer:
         with self.timer.stage("rerank"):
             known = [(ref, similarity, self.database.descriptor(ref.id)) for ref, similarity in candidates]
             query = ImageRef(-1, frame.stamp_ns, frame.camera)
-            closures = self.judge.judged(query, descriptor, predecessor, known, self.config.verify)
+            closures = self.judge.judged(query, descriptor, predecessor, known, self.config)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
-        decided = [self._decided(replace(c, query=query)) for c in closures]
-        return sorted(decided, key=lambda c: -c.score)
+            self.odometry.remember(query)
+        closures = [replace(c, query=query) for c in closures]
+        self.sequence.remember(frame.camera, closures, window_of(self.config.consistency))
+        return [self._decided(c) for c in closures]
 
     def change(self, config: Config) -> None:
         """Take the live settings of another Config, from the next frame on."""
@@ -72,16 +78,28 @@ class PlaceRecognizer:
     def new_session(self) -> None:
         """What comes next is another run: its stamps may lie before those already seen."""
         self.database.new_session()
-        self.keyframes.forget()
+        self._forget_the_past()
 
     def reset(self) -> None:
         """Forget every keyframe."""
         self.database.clear()
+        self._forget_the_past()
+
+    def _forget_the_past(self) -> None:
         self.keyframes.forget()
+        self.sequence.forget()
+        self.odometry.forget()
 
     def _decided(self, closure: LoopClosure) -> LoopClosure:
-        if closure.evidence.texture < self.config.min_texture:
-            return replace(closure, score=0.0, reason=Reason.LOW_TEXTURE)
-        if closure.score < self.config.accept_score:
+        config = self.config
+        if closure.evidence.texture < config.min_texture:
+            return replace(closure, reason=Reason.LOW_TEXTURE)
+        if closure.score < config.accept_score:
             return replace(closure, reason=Reason.LOW_SCORE)
+        gate = config.odometry_drift, config.odometry_slack_m, config.min_travelled_m
+        if self.odometry.impossible(closure.query, closure.match, *gate):
+            return replace(closure, reason=Reason.ODOMETRY)
+        path = self.sequence.path(closure, window_of(config.consistency))
+        if closure.score < config.sure_score and not confirmed(path, config.consistency):
+            return replace(closure, reason=Reason.UNCONFIRMED)
         return replace(closure, accepted=True)

@@ -1,0 +1,221 @@
+"""Closures on sequences of known truth: fit the calibration, and judge score and consistency.
+
+    python -m benchmarks.closures fit  --shared ../shared [--weights MODEL] [--write]
+    python -m benchmarks.closures judge --shared ../shared [--weights MODEL] [--plot OUT.png] [NAMES]
+
+`fit` uses the sets that may train a shipped model and writes the calibration into the model file; `judge` reports
+on the others. Descriptors are kept in a cache folder by the model's fingerprint.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.closure_sets import FIT, IGNORE, JUDGE, TRUE, TruthSequence, sequence
+from pnv_core.calibration import Calibration, fit_calibration, reliability, write_calibration
+from pnv_core.config import Config
+from pnv_core.describer import Describer, describer_from
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.types import LoopClosure, PatchGrid, PlaceDescriptor
+from pnv_core.weights import resolve_weights
+
+
+class RememberedDescriber:
+    """A describer that knows the images of one sequence by heart; it gives them in the order they are asked for."""
+
+    def __init__(self, describer: Describer, images: TruthSequence, cache: Path) -> None:
+        self.config, self.model, self.fingerprint = describer.config, describer.model, describer.fingerprint
+        self.at = 0
+        folder = cache / f"{describer.fingerprint[:12]}_{self.config.image_width}x{self.config.image_height}"
+        folder.mkdir(parents=True, exist_ok=True)
+        file = folder / f"{images.name}.npz"
+        if not file.exists():
+            described = [describer.describe(frame.rgb) for frame in images.frames()]
+            patches = {
+                f"patches_{i}": np.stack([d.patches[i].descriptors.astype(np.float16) for d in described])
+                for i in range(len(self.config.patch_sizes))
+            }
+            vectors = np.stack([d.global_vector for d in described])
+            np.savez(file, vectors=vectors, texture=np.array([d.texture for d in described]), **patches)
+        with np.load(file) as stored:
+            self._stored = {name: stored[name] for name in stored.files}
+        self._grids = describer.grids()
+
+    def describe(self, rgb: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> PlaceDescriptor:
+        s, i = self._stored, self.at
+        patches = tuple(
+            PatchGrid(size, rows, cols, s[f"patches_{n}"][i].astype(np.float32), stride)
+            for n, (size, stride, rows, cols) in enumerate(self._grids)
+        )
+        return PlaceDescriptor(s["vectors"][i], patches, float(s["texture"][i]))
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """What the recogniser said of a sequence: per query keyframe its candidates with their truth, best first.
+
+    `loops` are the queries with a true keyframe among those that might be matched.
+    """
+
+    name: str
+    queries: list[list[tuple[LoopClosure, int]]]
+    loops: NDArray[np.bool_]
+
+    def candidates(self) -> Iterator[tuple[LoopClosure, int]]:
+        return ((c, label) for found in self.queries for c, label in found if label != IGNORE)
+
+
+def judged(images: TruthSequence, describer: Describer, cache: Path, **settings) -> Judged:
+    """Run the recogniser over a sequence, with the default settings but for the sequence's own exclusion window."""
+    config = describer.config.replace(exclude_recent_s=images.exclude_recent_s, **settings)
+    remembered = RememberedDescriber(describer, images, cache)
+    remembered.config = config
+    recognizer = PlaceRecognizer(config, remembered)  # type: ignore[arg-type]
+    image_of: dict[int, int] = {}
+    queries, loops = [], []
+    for i, frame in enumerate(images.frames()):
+        if i in images.starts:
+            recognizer.new_session()
+        remembered.at = i
+        before = recognizer.database.refs()
+        closures = recognizer.process(frame)
+        if (last := recognizer.database.last()) is not None and last.id not in image_of:
+            image_of[last.id] = i
+            current = recognizer.database.session
+            counted = images.queries is None or images.queries[i]
+            old = [
+                r
+                for r in before
+                if r.session != current or r.stamp_ns <= frame.stamp_ns - config.exclude_recent_s * 1e9
+            ]
+            if counted and old and not (images.starts and i < images.starts[0]):
+                queries.append([(c, images.truth(i, image_of[c.match.id])) for c in closures])
+                loops.append(any(images.truth(i, image_of[r.id]) == TRUE for r in old))
+            elif images.queries is not None and old and not images.starts:  # no loop is known here: closures are false
+                queries.append([(c, images.truth(i, image_of[c.match.id])) for c in closures])
+                loops.append(False)
+    return Judged(images.name, queries, np.array(loops, bool))
+
+
+def examples(found: Judged) -> tuple[list, list[bool]]:
+    pairs = list(found.candidates())
+    return [c.evidence for c, _ in pairs], [label == TRUE for _, label in pairs]
+
+
+def fit(shared: Path, describer: Describer, cache: Path, names: tuple[str, ...]) -> Calibration:
+    """The calibration of the sets that may train a shipped model; every set counts the same."""
+    evidence, truth, weights = [], [], []
+    for name in names:
+        found = judged(sequence(name, shared), describer, cache, verify=10, consistency=0, accept_score=1.0)
+        e, t = examples(found)
+        evidence += e
+        truth += t
+        weights += [1.0 / len(e)] * len(e)
+        print(f"{name:<16} {len(found.queries):5d} queries {len(e):6d} candidates {sum(t):5d} true", flush=True)
+    return fit_calibration(
+        list(zip(evidence, truth, strict=True)), np.array(weights), describer.config, ", ".join(names)
+    )
+
+
+def recall_at_full_precision(scores: NDArray, correct: NDArray, loops: int) -> float:
+    """Share of the loop queries found above the best false closure. scores, correct (Q,): each query's best."""
+    highest_false = scores[~correct].max(initial=-np.inf)
+    return float((correct & (scores > highest_false)).sum() / loops) if loops else float("nan")
+
+
+def table(found: Judged) -> list[dict]:
+    """One row per way to decide: by similarity, by spatial score, by calibrated score, and after consistency."""
+    rows = []
+    loops = int(found.loops.sum())
+    ways = {
+        "global": (lambda c: c.similarity, lambda c: c.similarity >= 0.5),
+        "spatial": (lambda c: c.spatial, lambda c: c.spatial >= 0.5),
+        "calibrated": (lambda c: c.score, lambda c: c.score >= 0.5),
+        "confirmed": (lambda c: c.score, lambda c: c.accepted),
+    }
+    for way, (score, accepts) in ways.items():
+        known = [[(c, label) for c, label in query if label != IGNORE] for query in found.queries]
+        best = [max(query, key=lambda pair: score(pair[0])) if query else None for query in known]
+        scores = np.array([score(b[0]) if b else -1.0 for b in best])
+        correct = np.array([b is not None and b[1] == TRUE for b in best])
+        accepted = [[label for c, label in query if accepts(c)] for query in known]
+        false = sum(label != TRUE for labels in accepted for label in labels)
+        true = sum(label == TRUE for labels in accepted for label in labels)
+        hit = np.array([TRUE in labels for labels in accepted])
+        everything = [
+            (score(c), label == TRUE) for query in known for c, label in query if way != "confirmed" or c.accepted
+        ]
+        p = np.clip([s for s, _ in everything], 0, 1) if everything else np.zeros(0)
+        t = np.array([label for _, label in everything], bool)
+        rows.append(
+            {
+                "sequence": found.name, "way": way, "queries": len(found.queries), "loops": loops,
+                "precision": true / (true + false) if true + false else float("nan"), "false": false,
+                "recall": float((hit & found.loops).sum() / loops) if loops else float("nan"),
+                "recall@100%": recall_at_full_precision(scores, correct, loops),
+                "ece": reliability(p, t).expected_error if len(p) else float("nan"),
+            }
+        )  # fmt: skip
+    return rows
+
+
+def printed(row: dict) -> str:
+    return (
+        f"{row['sequence']:<14} {row['way']:<11} {row['queries']:5d} {row['loops']:5d}  {row['precision']:9.3f} "
+        f"{row['false']:6d} {row['recall']:7.3f} {row['recall@100%']:12.3f} {row['ece']:6.3f}"
+    )
+
+
+def plot_reliability(results: list[Judged], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(5, 5))
+    axes = figure.subplots()
+    axes.plot([0, 1], [0, 1], color="0.7")
+    for found in results:
+        pairs = [(c.score, label == TRUE) for c, label in found.candidates()]
+        diagram = reliability(np.array([s for s, _ in pairs]), np.array([t for _, t in pairs]))
+        axes.plot(diagram.score, diagram.share_true, marker="o", label=f"{found.name} ({diagram.expected_error:.3f})")
+    axes.set_xlabel("score")
+    axes.set_ylabel("share of true closures")
+    axes.legend(title="set (expected calibration error)", fontsize="small")
+    figure.savefig(path, dpi=120, bbox_inches="tight")
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.closures", description=__doc__)
+    parser.add_argument("what", choices=("fit", "judge"))
+    parser.add_argument("names", nargs="*")
+    parser.add_argument("--shared", type=Path, default=Path("../shared"))
+    parser.add_argument("--weights", default="default")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "pnv_closures")
+    parser.add_argument("--write", action="store_true", help="write the calibration into the model file")
+    parser.add_argument("--plot", type=Path, help="reliability diagram")
+    args = parser.parse_args(argv)
+    describer = describer_from(Config.make(weights=args.weights))
+    if args.what == "fit":
+        calibration = fit(args.shared, describer, args.cache, tuple(args.names) or FIT)
+        print(calibration)
+        if args.write:
+            write_calibration(resolve_weights(args.weights), calibration)
+        return 0
+    print(f"{'sequence':<14} {'way':<11} {'query':>5} {'loops':>5}  precision  false  recall  recall@100%P    ece")
+    results = []
+    for name in args.names or JUDGE:
+        found = judged(sequence(name, args.shared), describer, args.cache)
+        results.append(found)
+        for row in table(found):
+            print(printed(row), flush=True)
+    if args.plot:
+        plot_reliability(results, args.plot)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
