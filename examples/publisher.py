@@ -13,6 +13,7 @@ from pathlib import Path
 
 import rclpy
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Image
@@ -72,7 +73,8 @@ def main() -> int:
             print(json.dumps({"name": name, "stamp_ns": frame.stamp_ns, "sent": time.monotonic()}), flush=True)
         while poses:
             odometry.publish(odometry_message(*poses.popleft()))
-        time.sleep(1.0)  # the middleware delivers what is on its way before the process ends
+        odometry.wait_for_all_acked(Duration(seconds=20))
+        time.sleep(1.0)  # the last image is on its way
     except PnvError as error:
         print(f"publisher: {error}", file=sys.stderr)
         return 2

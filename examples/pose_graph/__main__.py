@@ -27,7 +27,7 @@ from examples.publisher import IMAGE_TOPIC
 from pnv_core.errors import PnvError
 from pnv_core.types import LoopClosure
 
-_LATE_S = 4.0  # the node may still work on the last frames
+_LATE_S, _LATEST_S = 4.0, 20.0  # the node may still work on the last frames
 _SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -77,9 +77,10 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[Loop
                 node_process(environment, parameters, assignments, None) as node,
                 publisher_process(environment, flags) as publisher,
             ):
-                ended = None
-                while ended is None or time.monotonic() - ended < _LATE_S:
+                ended, late = None, _LATEST_S
+                while ended is None or time.monotonic() - ended < late:
                     rclpy.spin_once(back_end, timeout_sec=0.1)
+                    late = _LATE_S if len(back_end.back_end.stamps) == len(walk.stamps_ns) else _LATEST_S
                     if node.return_code is not None:
                         raise PnvError(f"the node ended with {node.return_code}:\n" + "\n".join(node.lines[-15:]))
                     if ended is None and publisher.return_code is not None:
