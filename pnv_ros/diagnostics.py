@@ -22,7 +22,7 @@ class Diagnostics:
     def __init__(self, node: Node, recognition: Recognition, statistics: Statistics) -> None:
         self._node, self._recognition, self._statistics = node, recognition, statistics
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
-        self._looks: deque[tuple[float, int, int, int]] = deque()
+        self._looks: deque[tuple[float, int, int, int, int]] = deque()
         self._seen: dict[str, tuple[int, float]] = {}
         self._warned: dict[str, float] = {}
 
@@ -39,11 +39,11 @@ class Diagnostics:
         """Publish the status of this second."""
         now = time.monotonic()
         received, processed, dropped = self._statistics.totals()
-        unusable = dropped.get(Drop.UNUSABLE, 0)
-        self._looks.append((now, received, processed, unusable))
+        unusable, behind = dropped.get(Drop.UNUSABLE, 0), dropped.get(Drop.STAMP_BACK, 0)
+        self._looks.append((now, received, processed, unusable, behind))
         while now - self._looks[0][0] > _WINDOW_S and len(self._looks) > 2:
             self._looks.popleft()
-        then, received_then, processed_then, unusable_then = self._looks[0]
+        then, received_then, processed_then, unusable_then, behind_then = self._looks[0]
         span = max(now - then, 1e-9)
         rates = (received - received_then) / span, (processed - processed_then) / span
         silent = self._silent(now, settings.node.no_image_warning_s, settings.node.image_topics)
@@ -56,6 +56,9 @@ class Diagnostics:
             level, text = DiagnosticStatus.WARN, f"no image for {seconds:.0f} s on {topic}: {inputs.hint(topic)}"
         elif unusable > unusable_then:
             level, text = DiagnosticStatus.WARN, f"{unusable - unusable_then} unusable images of late; see the log"
+        elif behind > behind_then:
+            level = DiagnosticStatus.WARN
+            text = f"{behind - behind_then} frames of late have stamps before the last one and are skipped (~/reset)"
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
         self.publish(level, text, self._values(rates, settings))

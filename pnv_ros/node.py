@@ -174,7 +174,7 @@ class PlaceRecognizerNode(LifecycleNode):
             )
         self._stamps = StampRule(config.on_stamp_back)
         outputs = Outputs(self, config, describer.image_size)
-        self._recognition = Recognition(recognizer, views, outputs, self._statistics, self.get_logger())
+        self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
         self._infos = [
             self.create_subscription(CameraInfo, topic, self._rectify(views[camera], camera), 1)

@@ -14,7 +14,7 @@ from pnv_core.types import Frame, LoopClosure
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Settings
 from pnv_ros.slot import WaitingFrame
-from pnv_ros.stamps import in_seconds
+from pnv_ros.stamps import StampRule, in_seconds
 from pnv_ros.statistics import Drop, Statistics
 from pnv_ros.view import View
 
@@ -30,10 +30,11 @@ class Recognition:
         views: dict[str, View],
         outputs: Outputs,
         statistics: Statistics,
+        stamps: StampRule,
         log: Any,
     ) -> None:
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
-        self._statistics, self._log = statistics, log
+        self._statistics, self._stamps, self._log = statistics, stamps, log
         self._session = 0
         self._still = threading.Lock()
         self._sizes: dict[str, tuple[int, int]] = {}
@@ -50,10 +51,11 @@ class Recognition:
             self.outputs.config = settings.node
 
     def reset(self) -> int:
-        """Forget every keyframe; how many there were."""
+        """Forget every keyframe and stamp; how many keyframes there were."""
         with self._still:
             count = len(self.recognizer.database)
             self.recognizer.reset()
+            self._stamps.forget()
             self.outputs.markers.forget()
             return count
 
@@ -79,6 +81,7 @@ class Recognition:
                 frame = self._unpacked(waiting)
                 closures = self.recognizer.process(frame)
             except ImageError as error:
+                self._stamps.unusable(waiting.camera, waiting.stamp_ns)
                 count = self._statistics.drop(Drop.UNUSABLE)
                 self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
                 return

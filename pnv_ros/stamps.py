@@ -1,5 +1,6 @@
 """What happens to header stamps that repeat or go back, as in a bag played in a loop."""
 
+import threading
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -28,7 +29,8 @@ class Ruling:
 class StampRule:
     """Stamps of one camera must rise. One that repeats is skipped always, one that goes back by `on_stamp_back`.
 
-    A step back of less than REORDERED_NS is a late frame, not a new run, and is skipped either way.
+    A step back of less than REORDERED_NS is a late frame, not a new run, and is skipped either way. The stamp of a
+    frame that turned out to be unusable does not count. Judged by the callbacks, told of unusable frames by the worker.
     """
 
     REORDERED_NS = 1_000_000_000
@@ -36,17 +38,41 @@ class StampRule:
     def __init__(self, on_stamp_back: str) -> None:
         self._new_session = on_stamp_back == "new_session"
         self._last: dict[str, int] = {}
-        self.session = 0
+        self._usable: dict[str, int] = {}  # last stamp of a camera not known to be unusable, before `_last`
+        self._lock = threading.Lock()
+        self._session = 0
 
     def judge(self, camera: str, stamp_ns: int) -> Ruling:
-        last = self._last.get(camera)
-        if last is None or stamp_ns > last:
-            self._last[camera] = stamp_ns
-            return Ruling(StampVerdict.USE, self.session)
-        if stamp_ns == last:
-            return Ruling(StampVerdict.REPEATED, self.session)
-        if not self._new_session or last - stamp_ns < self.REORDERED_NS:
-            return Ruling(StampVerdict.BACK, self.session, last - stamp_ns)
-        self.session += 1
-        self._last = {camera: stamp_ns}
-        return Ruling(StampVerdict.NEW_SESSION, self.session, last - stamp_ns)
+        with self._lock:
+            last = self._last.get(camera)
+            if last is None or stamp_ns > last:
+                self._advance(camera, stamp_ns)
+                return Ruling(StampVerdict.USE, self._session)
+            if stamp_ns == last:
+                return Ruling(StampVerdict.REPEATED, self._session)
+            if not self._new_session or last - stamp_ns < self.REORDERED_NS:
+                return Ruling(StampVerdict.BACK, self._session, last - stamp_ns)
+            self._session += 1
+            self._last.clear()
+            self._usable.clear()
+            self._advance(camera, stamp_ns)
+            return Ruling(StampVerdict.NEW_SESSION, self._session, last - stamp_ns)
+
+    def unusable(self, camera: str, stamp_ns: int) -> None:
+        """The frame of this stamp could not be used: its stamp must not hold back the next one."""
+        with self._lock:
+            if self._last.get(camera) == stamp_ns:
+                del self._last[camera]
+                if camera in self._usable:
+                    self._last[camera] = self._usable[camera]
+
+    def forget(self) -> None:
+        """Any stamp may come next."""
+        with self._lock:
+            self._last.clear()
+            self._usable.clear()
+
+    def _advance(self, camera: str, stamp_ns: int) -> None:
+        if camera in self._last:
+            self._usable[camera] = self._last[camera]
+        self._last[camera] = stamp_ns
