@@ -10,6 +10,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Float64MultiArray
 
+from msg_adapters.lio_sam import LioSamGate
 from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam, closures_to_message
 from msg_adapters.pictures import rgb_to_message
 from pnv_core.drawing import draw_match
@@ -35,7 +36,7 @@ class Outputs:
         self._lio_sam = node.create_publisher(Float64MultiArray, "~/lio_sam", TABLE_QOS)
         self._candidates = node.create_publisher(PointCloud2, "~/candidates", TABLE_QOS)
         self._match_image = node.create_publisher(Image, "~/match_image", PICTURE_QOS)
-        self._last_lio_sam_ns: int | None = None
+        self._lio_sam_gate = LioSamGate()
 
     def close(self) -> None:
         for publisher in (self._closures, self._lio_sam, self._candidates, self._match_image):
@@ -43,7 +44,7 @@ class Outputs:
         self.markers.close()
 
     def new_session(self) -> None:
-        self._last_lio_sam_ns = None
+        self._lio_sam_gate.forget()
 
     def publish(self, frame: Frame, closures: Sequence[LoopClosure], picture_of: Callable[[int], bytes]) -> None:
         """Everything there is to say about one query; `closures` best first, refused ones too, not empty.
@@ -64,14 +65,9 @@ class Outputs:
         """The best closure old enough for LIO-SAM, which takes no loops within its own window."""
         if not self.config.publish_lio_sam:
             return
-        gap_ns, interval_ns = self.config.lio_sam_gap_s * 1e9, self.config.lio_sam_interval_s * 1e9
-        best = next((c for c in accepted if c.query.stamp_ns - c.match.stamp_ns >= gap_ns), None)
-        if best is None:
-            return
-        last = self._last_lio_sam_ns
-        if last is None or best.query.stamp_ns - last >= interval_ns:
+        best = self._lio_sam_gate.chosen(accepted, self.config.lio_sam_interval_s, self.config.lio_sam_gap_s)
+        if best is not None:
             self._lio_sam.publish(closure_to_lio_sam(best))
-            self._last_lio_sam_ns = best.query.stamp_ns
 
     def _picture(self, frame: Frame, closure: LoopClosure, reference: bytes) -> Image:
         verdict = "accepted" if closure.accepted else f"refused: {closure.reason}"
