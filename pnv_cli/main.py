@@ -7,7 +7,7 @@ from importlib import import_module
 
 from pnv_core.errors import PnvError
 
-COMMANDS = ("describe", "match", "run", "recall", "evaluate", "weights", "map", "doctor", "bench")
+COMMANDS = ("describe", "match", "run", "recall", "evaluate", "calibrate", "weights", "map", "doctor", "bench")
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,7 +12,6 @@ from pnv_core.reranker import Reranker, SpatialResult
 from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor
 
 _NEIGHBOURS = 10  # keyframes this close in number show one place
-_WORTH_A_LOOK = 0.01  # a candidate below this score is not examined further
 
 Candidate = tuple[ImageRef, float, PlaceDescriptor]  # keyframe, similarity, descriptor
 
@@ -58,7 +57,7 @@ class Judge:
         found.sort(key=lambda pair: _rank(pair[0]))
         for place, (closure, number) in enumerate(found[: config.verify]):
             picture = candidates[number][2].thumbnail
-            if descriptor.thumbnail and picture and closure.score >= _WORTH_A_LOOK:
+            if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
                 seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
                 found[place] = self._closure(query, closure.match, seen, results[number], config.min_texture), number
