@@ -18,10 +18,17 @@ from pnv_core.weights import cache_folder
 Record = Mapping[str, NDArray]  # what is stored of one image, by name
 
 
+_known_keys: dict[tuple[str, int, int], str] = {}  # (path, size, time of change) -> key, for this process
+
+
 def content_key(path: Path) -> str:
-    """sha256 of a file's bytes. Raises OSError."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """sha256 of a file's bytes; read once per process unless it changes. Raises OSError."""
+    status = path.stat()
+    known = (str(path), status.st_size, status.st_mtime_ns)
+    if known not in _known_keys:
+        with open(path, "rb") as file:
+            _known_keys[known] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _known_keys[known]
 
 
 def default_cache() -> Path:
