@@ -21,7 +21,15 @@ from pnv_core.evaluation.extraction import Describing, Extraction, Progress, lea
 from pnv_core.evaluation.methods import Method
 from pnv_core.evaluation.metrics import Decisions, first_hits, unique_groups
 from pnv_core.evaluation.ranking import Ranking, rerank, retrieve
+from pnv_core.evaluation.store import code_version
 
+_SCORING = tuple(
+    f"pnv_core.{name}"
+    for name in (
+        "matching", "spatial", "kernels", "reranker", "evaluation.methods", "evaluation.multiscale",
+        "evaluation.local_features",
+    )
+)  # fmt: skip
 MATRIX_SIDE = 160  # rows and columns kept of the similarity matrix
 
 
@@ -203,7 +211,12 @@ class Evaluation:
         completed = self.completed(method.config(self.config))
         score = method.pair_score(completed)
         assert score is not None
-        identity = [features.extractor.fingerprint, cv2.__version__, *method.identity(completed)]
+        identity = [
+            features.extractor.fingerprint,
+            cv2.__version__,
+            code_version(*_SCORING),
+            *method.identity(completed),
+        ]
         name = hashlib.sha256(json.dumps(identity, default=str).encode()).hexdigest()[:24]
         journal = Journal(self.cache / "matches" / f"{name}.jsonl")
 

@@ -19,11 +19,17 @@ from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.errors import ConfigError, PnvError
-from pnv_core.evaluation.store import DescriptorStore, Record, content_key
+from pnv_core.evaluation.store import DescriptorStore, Record, code_version, content_key
 from pnv_core.images import read_image
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
-_FORMAT = 1  # raised when the same extraction would store other values
+_DESCRIBING = tuple(
+    f"pnv_core.{name}"
+    for name in (
+        "describer", "netvlad", "patches", "kernels", "trunks", "compact", "rootsift", "evaluation.extractors",
+        "evaluation.extraction", "evaluation.local_features",
+    )
+)  # fmt: skip
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]  # (items, how many, what) -> the same items
 
 
@@ -91,7 +97,7 @@ class Describing:
     def __init__(self, extraction: Extraction, cache: Path, memory_mb: float = 256.0) -> None:
         self.extraction = extraction
         self.extractor = extraction.open()
-        identity = json.dumps([_FORMAT, extraction.kind, self.extractor.fingerprint])
+        identity = json.dumps([code_version(*_DESCRIBING), extraction.kind, self.extractor.fingerprint])
         name = hashlib.sha256(identity.encode()).hexdigest()[:24]
         self.store = DescriptorStore(cache / f"{extraction.kind}-{name}", memory_mb)
 

@@ -7,6 +7,7 @@ import threading
 import zipfile
 from collections import OrderedDict
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,15 @@ def content_key(path: Path) -> str:
         with open(path, "rb") as file:
             _known_keys[known] = hashlib.file_digest(file, "sha256").hexdigest()
     return _known_keys[known]
+
+
+def code_version(*modules: str) -> str:
+    """A hash of the source of modules, by name: what is stored by one version of them is not taken for another's."""
+    digest = hashlib.sha256()
+    for name in modules:
+        origin = getattr(find_spec(name), "origin", None)
+        digest.update(Path(origin).read_bytes() if origin else name.encode())
+    return digest.hexdigest()[:16]
 
 
 def default_cache() -> Path:
