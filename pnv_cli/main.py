@@ -7,7 +7,20 @@ from importlib import import_module
 
 from pnv_core.errors import PnvError
 
-COMMANDS = ("describe", "match", "run", "recall", "evaluate", "calibrate", "weights", "map", "doctor", "bench")
+COMMANDS = (
+    "describe",
+    "match",
+    "run",
+    "recall",
+    "evaluate",
+    "calibrate",
+    "fit",
+    "train",
+    "weights",
+    "map",
+    "doctor",
+    "bench",
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

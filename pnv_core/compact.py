@@ -8,7 +8,7 @@ from pnv_core.trunks import CELL, Trunk, _ImageNetInput
 
 
 class Fire(nn.Module):
-    """Squeeze and expand (SqueezeNet 1.1, Iandola et al. 2016): 1x1, then 1x1 beside 3x3; the last one may end linear."""
+    """Squeeze and expand (SqueezeNet 1.1, Iandola et al. 2016): 1x1, then 1x1 beside 3x3."""
 
     def __init__(self, inputs: int, squeeze: int, expand: int, relu: bool = True) -> None:
         super().__init__()
@@ -55,11 +55,19 @@ class CompactTrunk(Trunk):
         self.neck = nn.Conv2d(width, neck, 1) if neck else nn.Identity()
         self.channels = neck or width
 
-    def backbone(self, images: Tensor) -> Tensor:
-        """(B, 3, H, W) -> (B, width, h, w), before the neck."""
+    def front(self, images: Tensor, layers: int) -> Tensor:
+        """(B, 3, H, W) -> what the first `layers` of `features` give."""
         height, width = (side // CELL * CELL for side in images.shape[2:])
         x = self.input(images[:, :, :height, :width])
-        return self.features(F.pad(x, (0, 1, 0, 1)))  # type: ignore[no-any-return]
+        return self.features[:layers](F.pad(x, (0, 1, 0, 1)))  # type: ignore[no-any-return]
+
+    def back(self, maps: Tensor, layers: int) -> Tensor:
+        """The rest after `front` with as many layers: -> (B, C, h, w)."""
+        return self.neck(self.features[layers:](maps))  # type: ignore[no-any-return]
+
+    def backbone(self, images: Tensor) -> Tensor:
+        """(B, 3, H, W) -> (B, width, h, w), before the neck."""
+        return self.front(images, len(self.features))
 
     def forward(self, images: Tensor) -> Tensor:
         return self.neck(self.backbone(images))  # type: ignore[no-any-return]

@@ -129,37 +129,42 @@ def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
     return items
 
 
+@torch.no_grad()
 def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
     """The feature map (1, C, h, w) of an image file, on the device of the trunk."""
     device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
     return trunk(as_batch([read_rgb(path, options.image_width, options.image_height)], device)).float()  # type: ignore[no-any-return]
 
 
-@torch.inference_mode()
-def fit_vocabulary(trunk: Trunk, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress) -> NetVLAD:
-    """A NetVLAD layer from the images: clusters by spherical k-means, assignment by the alpha rule."""
+@torch.no_grad()
+def local_samples(maps: Iterable[Tensor], options: FitOptions) -> Tensor:
+    """Unit local features (M, C) drawn from feature maps (1, C, h, w) or (C, h, w)."""
     generator = torch.Generator().manual_seed(options.seed)
     drawn = []
-    for path in progress(files, "local features"):
-        cells = features_of(trunk, path, options)[0].flatten(1).T.cpu()  # (N, C)
-        cells = F.normalize(cells, dim=1)[torch.randperm(len(cells), generator=generator)[: options.cells_per_image]]
+    for features in maps:
+        cells = features.flatten(-2).flatten(0, -2).T.float().cpu()  # (N, C)
+        cells = F.normalize(cells[torch.randperm(len(cells), generator=generator)[: options.cells_per_image]], dim=1)
         drawn.append(cells[cells.any(1)])
-    samples = torch.cat(drawn)
-    netvlad = NetVLAD(options.clusters, trunk.channels)
-    centroids = spherical_kmeans(samples, options.clusters, generator)
+    return torch.cat(drawn)
+
+
+@torch.no_grad()
+def vocabulary_of(maps: Iterable[Tensor], options: FitOptions) -> NetVLAD:
+    """A NetVLAD layer from feature maps: clusters by spherical k-means, assignment by the alpha rule."""
+    samples = local_samples(maps, options)
+    netvlad = NetVLAD(options.clusters, samples.shape[1])
+    centroids = spherical_kmeans(samples, options.clusters, torch.Generator().manual_seed(options.seed))
     netvlad.load_state_dict({"centroids": centroids, "assignment": alpha_rule(centroids, samples)})
     return netvlad
 
 
-@torch.inference_mode()
-def fit_projections(
-    trunk: Trunk, netvlad: NetVLAD, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
-) -> tuple[Projection, Projection]:
-    """The global and the patch projection by PCA over the images' VLADs and over patches of every size."""
+@torch.no_grad()
+def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions) -> tuple[Projection, Projection]:
+    """The global and the patch projection by PCA over the maps' VLADs and over patches of every size."""
     generator = torch.Generator().manual_seed(options.seed + 1)
     whole, parts = [], []
-    for path in progress(files, "projections"):
-        features = features_of(trunk, path, options).cpu()
+    for features in maps:
+        features = features.reshape(1, *features.shape[-3:]).float().cpu()
         x, weights = netvlad.soft_assign(features)
         whole.append(netvlad.vlad(x, weights)[0])
         shape = (features.shape[-2], features.shape[-1])
@@ -173,6 +178,13 @@ def fit_projections(
     )
 
 
+def fit_vocabulary(
+    trunk: Trunk, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
+) -> NetVLAD:
+    """A NetVLAD layer from image files."""
+    return vocabulary_of((features_of(trunk, file, options) for file in progress(files, "vocabulary")), options)
+
+
 def fit_model(
     trunk: Trunk, info: ModelInfo, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
 ) -> Model:
@@ -184,7 +196,8 @@ def fit_model(
             f"allowed: 1 to {min(options.image_width, options.image_height) // CELL}"
         )
     netvlad = fit_vocabulary(trunk, files, options, progress)
-    whole, parts = fit_projections(trunk, netvlad, files, options, progress)
+    maps = (features_of(trunk, file, options) for file in progress(files, "projections"))
+    whole, parts = projections_of(netvlad, maps, options)
     info = replace(
         info,
         image_width=options.image_width,

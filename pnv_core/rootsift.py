@@ -1,4 +1,7 @@
-"""Dense RootSIFT: the features of DenseVLAD, the paper's baseline; no trained weights. h x w = H // 16 x W // 16 cells."""
+"""Dense RootSIFT: the features of DenseVLAD, the paper's baseline; no trained weights.
+
+h x w = H // 16 x W // 16 cells.
+"""
 
 import math
 

@@ -1,15 +1,14 @@
 """The state a training starts from: ImageNet trunk, principal neck, fitted vocabulary and projections."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import torch
-import torch.nn.functional as F
+from torch import Tensor
 
 from pnv_core.compact import CompactTrunk
 from pnv_core.errors import ModelError
-from pnv_core.fit import FitOptions, Progress, as_batch, fit_model, pca, plain_progress, read_rgb
+from pnv_core.fit import FitOptions, local_samples, pca, projections_of, vocabulary_of
 from pnv_core.model_files import Model, ModelInfo
 
 
@@ -23,41 +22,33 @@ def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> CompactTrunk:
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise ModelError(f"{weights}: not a readable tensor file ({error})") from None
     trunk = CompactTrunk(fires=fires, neck=0, relu=relu)
-    wanted = set(trunk.state_dict())
     try:
-        trunk.load_state_dict({name: tensors[name] for name in wanted})
+        trunk.load_state_dict({name: tensors[name] for name in trunk.state_dict()})
     except (KeyError, TypeError, RuntimeError) as error:
         raise ModelError(f"{weights}: no SqueezeNet 1.1 trunk ({error})") from None
-    return trunk.eval()
+    return trunk.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]
 
 
-@torch.inference_mode()
-def with_principal_neck(trunk: CompactTrunk, neck: int, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress) -> CompactTrunk:
-    """The trunk with a linear neck that keeps the `neck` leading principal directions of its unit local features."""
-    generator = torch.Generator().manual_seed(options.seed)
-    drawn = []
-    for path in progress(files, "neck"):
-        cells = trunk.backbone(as_batch([read_rgb(path, options.image_width, options.image_height)]))[0].flatten(1).T
-        drawn.append(F.normalize(cells[torch.randperm(len(cells), generator=generator)[: options.cells_per_image]], dim=1))
-    weight, _ = pca(torch.cat(drawn), neck, whiten=False)
-    whole = CompactTrunk(fires=sum(type(m).__name__ == "Fire" for m in trunk.features), neck=neck, relu=trunk.features[-1].relu)
+@torch.no_grad()
+def initial_model(
+    trunk: CompactTrunk,
+    neck: int,
+    maps: Callable[[], Iterable[Tensor]],
+    layers: int,
+    info: ModelInfo,
+    options: FitOptions,
+) -> Model:
+    """An untrained model around an ImageNet trunk, fitted to what its first `layers` gave for some images.
+
+    The neck keeps the `neck` leading principal directions of the unit local features. `maps` gives the same maps
+    (C', h, w) each time it is called.
+    """
+    ends = [trunk.features[layers:](m[None].float())[0] for m in maps()]
+    weight, _ = pca(local_samples(ends, options), neck, whiten=False)
+    whole = CompactTrunk(**info.trunk_options)
     whole.features.load_state_dict(trunk.features.state_dict())
     whole.neck.load_state_dict({"weight": weight[:, :, None, None], "bias": torch.zeros(neck)})
-    return whole.eval()
-
-
-def initial_model(
-    weights: Path | str,
-    fires: int,
-    neck: int,
-    relu: bool,
-    files: Sequence[Path],
-    options: FitOptions,
-    progress: Progress = plain_progress,
-) -> Model:
-    """An untrained model: ImageNet trunk, neck, vocabulary and projections fitted to the images."""
-    trunk = imagenet_trunk(weights, fires, relu)
-    if neck:
-        trunk = with_principal_neck(trunk, neck, files, options, progress)
-    info = ModelInfo("compact", {"fires": fires, "neck": neck, "relu": relu})
-    return fit_model(trunk, replace(info, provenance="ImageNet trunk, fitted vocabulary and projections"), files, options, progress)
+    necks = [whole.neck(end[None]) for end in ends]
+    netvlad = vocabulary_of(necks, options)
+    projections = projections_of(netvlad, necks, options)
+    return Model(info, whole, netvlad, *projections)

@@ -1,0 +1,236 @@
+"""Recall of the default model beside plain baselines, on the evaluation sets and on the training sets.
+
+    python benchmarks/recall_table.py --data ../shared/data --train ../shared/train \\
+        --imagenet ../shared/weights/squeezenet1_1_features.pth
+
+Baselines: the untrained trunk with GeM and with NetVLAD from k-means (no PCA), dense RootSIFT VLAD, each with a
+vocabulary fitted to the training photographs. Training sets, and what training held out of them, are asked for by
+augmented views of their own images. Queries are drawn by --seed.
+"""
+
+import argparse
+import json
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+
+from pnv_core.config import Config
+from pnv_core.describer import Describer, describer_from, resized
+from pnv_core.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
+from pnv_core.model_files import make_trunk
+from pnv_core.netvlad import NetVLAD
+from pnv_core.reranker import Reranker
+from pnv_core.training.initial import imagenet_trunk
+from pnv_core.training.sources import is_held, load_set
+from pnv_core.training.validation import synthetic_queries
+from pnv_core.trunks import Trunk
+from pnv_core.types import PlaceDescriptor
+
+SIZE = (320, 240)
+RECALLS = (1, 5, 10)
+Pixels = NDArray[np.uint8]
+Head = Callable[[torch.Tensor], torch.Tensor]
+DONKEY_EXCLUDED = 50  # raw frames a loop must be apart (the set's README)
+DONKEY_TOLERANCE = 20  # raw frames (1 s) around a true reference that count neither way
+
+
+@dataclass(frozen=True, eq=False)
+class RecallSet:
+    """truth and counted are (Q, R): one place; and whether the pair may be scored at all."""
+
+    name: str
+    queries: list[Path | Pixels]
+    references: list[Path | Pixels]
+    truth: NDArray[np.bool_]
+    counted: NDArray[np.bool_]
+
+
+def paired(folder: Path, queries: str, references: str) -> RecallSet:
+    """A folder with matches.csv and query and reference images in folders of their own."""
+    rows = _matches(folder)
+    found = sorted((folder / references).iterdir())
+    number = {f"{references}/{p.name}": i for i, p in enumerate(found)}
+    truth = np.zeros((len(rows), len(found)), bool)
+    for row, (_, true) in enumerate(rows):
+        truth[row, [number[t] for t in true]] = True
+    return RecallSet(folder.name, [folder / q for q, _ in rows], found, truth, np.ones_like(truth))
+
+
+def laps(folder: Path) -> RecallSet:
+    """donkey_desks_laps: earlier frames are the references; near misses count neither way."""
+    rows = _matches(folder)
+    found = sorted((folder / "images").iterdir())
+    frame = np.array([int(p.stem) for p in found])
+    truth = np.zeros((len(rows), len(found)), bool)
+    counted = np.zeros_like(truth)
+    for row, (query, true) in enumerate(rows):
+        truth[row] = np.isin(frame, [int(Path(t).stem) for t in true])
+        near = (np.abs(frame[:, None] - frame[truth[row]]) <= DONKEY_TOLERANCE).any(1)
+        counted[row] = (int(Path(query).stem) - frame > DONKEY_EXCLUDED) & (truth[row] | ~near)
+    return RecallSet(folder.name, [folder / "images" / q for q, _ in rows], found, truth, counted)
+
+
+def synthetic(folder: Path, queries: int, seed: int, held: bool) -> RecallSet:
+    """A training set, or what is held out of it: images as they are, asked for by their augmented views."""
+    images = [i for i in load_set(folder) if not i.panorama and is_held(i) == held]
+    known = synthetic_queries(folder.name, images, SIZE, queries, seed)
+    name = f"{folder.name}, {'held out' if held else 'trained on'}"
+    return RecallSet(name, list(known.queries), list(known.references), known.true, known.counted)
+
+
+def _matches(folder: Path) -> list[tuple[str, list[str]]]:
+    lines = (folder / "matches.csv").read_text().split("\n")[1:]
+    return [(line.split(",")[0], line.split(",")[1].strip().split(";")) for line in lines if line]
+
+
+def thinned(whole: RecallSet, queries: int, references: int, seed: int) -> RecallSet:
+    """At most so many queries and references, drawn by seed; every query keeps a true reference."""
+    rng = random.Random(seed)
+    rows = sorted(rng.sample(range(len(whole.queries)), min(queries, len(whole.queries))))
+    needed = {int(rng.choice(np.flatnonzero(whole.truth[row] & whole.counted[row]))) for row in rows}
+    others = [i for i in range(len(whole.references)) if i not in needed]
+    columns = sorted(needed | set(rng.sample(others, max(0, min(references - len(needed), len(others))))))
+    grid = np.ix_(rows, columns)
+    return RecallSet(
+        whole.name,
+        [whole.queries[r] for r in rows],
+        [whole.references[c] for c in columns],
+        whole.truth[grid],
+        whole.counted[grid],
+    )
+
+
+def recalls(order: NDArray[np.int64], truth: NDArray[np.bool_]) -> list[float]:
+    hits = np.take_along_axis(truth, order, 1)
+    return [100 * float(hits[:, :n].any(1).mean()) for n in RECALLS]
+
+
+def ranked(queries: NDArray, references: NDArray, counted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    similarity = np.where(counted, queries @ references.T, -np.inf)
+    return np.argsort(-similarity, axis=1, kind="stable")
+
+
+@torch.inference_mode()
+def baseline_vectors(trunk: Trunk, heads: dict[str, Head], images: Sequence[Path | Pixels]) -> dict[str, NDArray]:
+    found: dict[str, list[NDArray]] = {name: [] for name in heads}
+    for image in images:
+        features = trunk(as_batch([pixels(image, SIZE)])).float()
+        for name, head in heads.items():
+            found[name].append(head(features)[0].numpy())
+    return {name: np.stack(rows) for name, rows in found.items()}
+
+
+def pixels(image: Path | Pixels, size: tuple[int, int]) -> Pixels:
+    return read_rgb(image, *size) if isinstance(image, Path) else resized(image, *size)
+
+
+def gem(features: torch.Tensor) -> torch.Tensor:
+    """Generalised mean, p = 3 (Radenovic et al., TPAMI 2018)."""
+    return F.normalize(features.clamp(min=1e-6).pow(3).mean((2, 3)).pow(1 / 3), dim=1)
+
+
+def fitted(trunk: Trunk, files: Sequence[Path]) -> NetVLAD:
+    with torch.inference_mode():
+        maps = (trunk(as_batch([read_rgb(f, *SIZE)])) for f in files)
+        return vocabulary_of(maps, FitOptions(clusters=16, cells_per_image=60))
+
+
+def baselines(args: argparse.Namespace) -> list[tuple[Trunk, dict[str, Head]]]:
+    """Trunks and what is made of their maps, vocabularies fitted to some of the training photographs."""
+    sample = image_files([args.train])
+    sample = sorted(random.Random(args.seed).sample(sample, min(200, len(sample))))
+    found: list[tuple[Trunk, dict[str, Head]]] = []
+    if args.imagenet and "untrained" in args.methods.split(","):
+        trunk = imagenet_trunk(args.imagenet, fires=8, relu=True)
+        found.append((trunk, {"untrained, GeM": gem, "untrained, NetVLAD k-means": fitted(trunk, sample)}))
+    if "rootsift" in args.methods.split(","):
+        sift = make_trunk("rootsift", {})
+        found.append((sift, {"dense RootSIFT VLAD": fitted(sift, sample)}))
+    return found
+
+
+def with_default(describer: Describer, known: RecallSet, depth: int) -> list[tuple[str, list[float]]]:
+    """The default model before and after re-ranking its first `depth`."""
+    queries, references = (
+        [_slim(describer.describe(pixels(image, describer.image_size))) for image in part]
+        for part in (known.queries, known.references)
+    )
+    vectors = [np.stack([d.global_vector for d in part]) for part in (queries, references)]
+    order = ranked(*vectors, known.counted)
+    reranker = Reranker(describer.config)
+    better = order.copy()
+    for row, query in enumerate(queries):
+        head = [c for c in order[row, :depth] if known.counted[row, c]]
+        scores = [reranker.score(query, references[c]).score for c in head]
+        better[row, : len(head)] = np.array(head)[np.argsort(-np.array(scores), kind="stable")]
+    return [("default, global", recalls(order, known.truth)), ("default, re-ranked", recalls(better, known.truth))]
+
+
+def opened(args: argparse.Namespace) -> Iterator[RecallSet]:
+    for name in filter(None, args.sets.split(",")):
+        folder = args.data / name
+        if name == "donkey_desks_laps":
+            whole = laps(folder)
+        else:
+            whole = paired(folder, *(("query_night", "ref_day") if name == "webcams_daynight" else ("query", "ref")))
+        yield thinned(whole, args.queries, args.references, args.seed)
+    for name in filter(None, args.training_sets.split(",")):
+        yield synthetic(args.train / name, args.queries, args.seed, held=False)
+        yield synthetic(args.train / name, args.queries, args.seed, held=True)
+
+
+def _slim(descriptor: PlaceDescriptor) -> PlaceDescriptor:
+    """Patches in half precision, as the database keeps them."""
+    slim = tuple(replace(p, descriptors=p.descriptors.astype(np.float16)) for p in descriptor.patches)
+    return replace(descriptor, patches=slim)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--train", type=Path, required=True)
+    parser.add_argument("--imagenet", type=Path, help="SqueezeNet 1.1 weights for the untrained baselines")
+    parser.add_argument("--weights", default="default")
+    sets = "webcams_daynight,gardens_point_thumbs,essex3in1_thumbs,donkey_desks_laps,pepper_s11"
+    parser.add_argument("--sets", default=sets)
+    parser.add_argument("--training-sets", default="ie_tower,polyhaven_hdri")
+    parser.add_argument("--methods", default="untrained,rootsift,default")
+    parser.add_argument("--queries", type=int, default=100)
+    parser.add_argument("--references", type=int, default=400)
+    parser.add_argument("--depth", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    plain = baselines(args)
+    describer = None
+    if "default" in args.methods.split(","):
+        describer = describer_from(Config.make(weights=args.weights, threads=args.threads))
+    table = []
+    print(f"{'set':34}{'queries':>8}  {'method':28}" + "".join(f"{f'R@{n}':>7}" for n in RECALLS))
+    for known in opened(args):
+        rows: list[tuple[str, list[float]]] = []
+        for trunk, heads in plain:
+            q, r = (baseline_vectors(trunk, heads, images) for images in (known.queries, known.references))
+            rows += [(h, recalls(ranked(q[h], r[h], known.counted), known.truth)) for h in heads]
+        if describer is not None:
+            rows += with_default(describer, known, args.depth)
+        for method, found in rows:
+            figures = {f"recall@{n}": round(v, 1) for n, v in zip(RECALLS, found, strict=True)}
+            table.append({"set": known.name, "queries": len(known.queries), "method": method} | figures)
+            print(
+                f"{known.name:34}{len(known.queries):8}  {method:28}" + "".join(f"{v:7.1f}" for v in found), flush=True
+            )
+    if args.json:
+        args.json.write_text(json.dumps(table, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
