@@ -53,7 +53,7 @@ class ExactIndex:
         pass
 
     def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        similarity = self._table.vectors[: len(allowed)] @ query
+        similarity = _similarities(self._table.vectors[: len(allowed)], query)
         return _largest(np.where(allowed, similarity, -np.inf), k)
 
 
@@ -260,8 +260,17 @@ def _build_ivfpq(rows: int, vectors: NDArray[np.float32]) -> Any:
     return index
 
 
+def _similarities(rows: NDArray[np.float32], query: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N, D), (D,) -> (N,) inner products by FAISS, twice to eight times as fast as the BLAS of numpy here."""
+    faiss = _faiss()
+    products = np.empty(len(rows), np.float32)
+    arrays = [products, np.ascontiguousarray(query), np.ascontiguousarray(rows)]  # held while FAISS has their addresses
+    faiss.fvec_inner_products_ny(*(faiss.swig_ptr(array) for array in arrays), rows.shape[1], len(rows))
+    return products
+
+
 def _faiss() -> Any:
-    import faiss  # 0.1 s that exact search need not pay; its type stubs are incomplete
+    import faiss  # not at the top: 0.1 s that reading a map need not pay; and its type stubs are incomplete
 
     return faiss
 
@@ -275,7 +284,7 @@ def _gaussian_codebook() -> NDArray[np.float32]:
 
 
 def _best(table: VectorTable, slots: NDArray[np.int64], query: NDArray[np.float32], k: int) -> NDArray[np.int64]:
-    return slots[_largest(table.vectors[slots] @ query, k)]
+    return slots[_largest(_similarities(table.vectors[slots], query), k)]
 
 
 def _largest(values: NDArray[np.float32], k: int) -> NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""Patches of cold keyframes on disk: one unnamed file of equal places per buffer size.
+"""Patches of cold keyframes on disk: one unnamed file of places in steps of an eighth of their size.
 
 Read and written by position, not memory-mapped: a page of a mapping counts as the process's memory while it is
 cached and turns an I/O error into a crash, where `pread` gives an OSError.
@@ -48,14 +48,14 @@ class PatchFile:
             ) from error
         self._limit = limit
         self.end = 0
-        self._free: defaultdict[int, deque[int]] = defaultdict(deque)  # by buffer size
+        self._free: defaultdict[int, deque[int]] = defaultdict(deque)  # by room
 
     def write(self, buffer: NDArray[np.uint8]) -> DiskBuffer | None:
         """The buffer on disk; None when the limit is reached. Raises OSError (a full disk)."""
-        nbytes = len(buffer)
-        free = self._free[nbytes]
+        room = _room(len(buffer))
+        free = self._free[room]
         place = free.popleft() if free else self.end
-        if place == self.end and self.end + nbytes > self._limit:
+        if place == self.end and self.end + room > self._limit:
             return None
         try:
             self._write_at(place, buffer.data)
@@ -63,8 +63,8 @@ class PatchFile:
             if place != self.end:
                 free.append(place)
             raise
-        self.end = max(self.end, place + nbytes)
-        return DiskBuffer(self, free, place, nbytes)
+        self.end = max(self.end, place + room)
+        return DiskBuffer(self, free, place, len(buffer))
 
     def _write_at(self, place: int, data: memoryview) -> None:
         while data:
@@ -78,3 +78,9 @@ class PatchFile:
             raise OSError(f"patch file in {self.folder}: {got} of {nbytes} bytes at {place}")
         buffer.flags.writeable = False
         return buffer
+
+
+def _room(nbytes: int) -> int:
+    """The place for a buffer: an eighth larger at most, so that keyframes of about one size share their places."""
+    step = 1 << max(0, nbytes.bit_length() - 4)
+    return -(-nbytes // step) * step
