@@ -1,5 +1,6 @@
 """A camera for the examples, as a process of its own: publishes a sequence, and odometry where a file gives it.
 
+Where the node drops frames because it is busy, the camera slows down: a small machine shows the same closures later.
 Prints one JSON line per image: {"name", "stamp_ns", "sent": seconds of the monotonic clock}.
 """
 
@@ -12,6 +13,7 @@ from collections import deque
 from pathlib import Path
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -25,6 +27,7 @@ from pnv_core.errors import PnvError
 
 IMAGE_TOPIC = "camera/image_raw"
 ODOMETRY_TOPIC = "odometry"
+BUSY = "dropped: busy"  # of the node's diagnostics
 _WAIT_FOR_LISTENERS_S = 60.0
 
 
@@ -47,10 +50,39 @@ def odometry_message(stamp_ns: int, pose: list[float]) -> Odometry:
     return message
 
 
+class Pace:
+    """The clock of the playback: `playback` times faster than the stamps, slower where the node cannot follow."""
+
+    def __init__(self, node: Node, playback: float) -> None:
+        self._node, self._playback = node, playback
+        self._last_stamp_ns: int | None = None
+        self._due = time.monotonic()
+        self._share, self._busy = 1.0, 0
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._adapt, 10)
+
+    def _adapt(self, message: DiagnosticArray) -> None:
+        for value in (pair.value for status in message.status for pair in status.values if pair.key == BUSY):
+            self._share = min(1.0, self._share * (1.15 if int(value) == self._busy else 0.6))
+            self._busy = int(value)
+
+    def wait(self, stamp_ns: int) -> None:
+        """Until the frame of this stamp is due."""
+        step_ns = 0 if self._last_stamp_ns is None else max(0, stamp_ns - self._last_stamp_ns)
+        self._last_stamp_ns = stamp_ns
+        start = self._due
+        while True:
+            self._due = start + step_ns / 1e9 / self._playback / self._share
+            left = self._due - time.monotonic()
+            if left <= 0:
+                break
+            rclpy.spin_once(self._node, timeout_sec=left)
+        self._due = max(self._due, time.monotonic() - 1.0)  # a slow source is not made up for by a burst
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_source_flags(parser)
-    parser.add_argument("--playback", type=float, default=2.0, help="times faster than the stamps; default 2")
+    parser.add_argument("--playback", type=float, default=2.0, help="times faster than the stamps, at most; default 2")
     parser.add_argument("--odometry", type=Path, help="CSV of stamp_ns,x,y,z,qx,qy,qz,qw to publish as odometry")
     args = parser.parse_args()
     poses = read_odometry(args.odometry) if args.odometry else deque()
@@ -61,12 +93,10 @@ def main() -> int:
     odometry = node.create_publisher(Odometry, ODOMETRY_TOPIC, QoSProfile(depth=500))
     try:
         _wait_for_listeners([images] + [odometry] * bool(poses))
-        first_stamp, start = None, time.monotonic()
+        pace = Pace(node, args.playback)
         for name, frame in named_frames(args):
-            first_stamp = frame.stamp_ns if first_stamp is None else first_stamp
-            due = start + (frame.stamp_ns - first_stamp) / 1e9 / args.playback
             message = rgb_to_message(frame.rgb, frame.stamp_ns, "camera")
-            time.sleep(max(0.0, due - time.monotonic()))
+            pace.wait(frame.stamp_ns)
             while poses and poses[0][0] <= frame.stamp_ns:
                 odometry.publish(odometry_message(*poses.popleft()))
             images.publish(message)

@@ -30,7 +30,7 @@ _START_S, _SETTLE_S = 120.0, 30.0
 def main() -> int:
     parser = argparse.ArgumentParser(prog="make demo", description=__doc__.splitlines()[0])
     add_source_flags(parser)
-    parser.add_argument("--playback", type=float, help="times faster than the stamps; default 2, of your own input 1")
+    parser.add_argument("--playback", type=float, help="times faster than the stamps, at most; default 2, own input 1")
     parser.add_argument("--exclude-recent-s", type=float, default=30.0, help="least age of a match; default 30")
     parser.add_argument("--parameter", action="append", default=[], metavar="NAME:=VALUE", help="of the node")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of what is written; default out")
