@@ -1,0 +1,69 @@
+"""A recogniser on a saved map says what the one that saved it says."""
+
+import json
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from pnv_core.database import KeyframeDatabase
+from pnv_core.maps import MapStore
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.types import Frame
+from test.core.small import small_describer
+from test.database.synthetic import SECOND
+
+SETTINGS = {"min_interval_s": 0.0, "min_change": 0.0, "accept_score": 0.0, "sure_score": 0.0, "patch_precision": "int8"}
+
+
+def _recognizer(read_only: bool) -> PlaceRecognizer:
+    describer = small_describer(**SETTINGS)
+    database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim, read_only=read_only)
+    return PlaceRecognizer(describer.config, describer, database)
+
+
+def _frames(laps_start_s: int, shift: int) -> list[Frame]:
+    """Eight places in a row, seen `shift` pixels further to the side."""
+    rng = np.random.default_rng(0)
+    walls = [cv2.resize(rng.integers(0, 255, (24, 36, 3), np.uint8), (288, 160)) for _ in range(8)]
+    return [
+        Frame((laps_start_s + i) * SECOND, "front", np.ascontiguousarray(wall[:, shift : shift + 192]))
+        for i, wall in enumerate(walls)
+    ]
+
+
+def _closures(recognizer: PlaceRecognizer) -> list[list]:
+    """Every candidate of a later visit, in plain values."""
+    return [
+        [c.match.id, c.match.stamp_ns, c.match.session, c.accepted, c.score, c.similarity, c.spatial, c.inliers]
+        for frame in _frames(1000, 16)
+        for c in recognizer.process(frame)
+    ]
+
+
+def visit(path: str) -> None:
+    """In a process of its own: load, look again, print."""
+    recognizer = _recognizer(read_only=True)
+    MapStore(path, recognizer.describer.fingerprint).load(recognizer.database)
+    print(json.dumps(_closures(recognizer)))
+
+
+@pytest.mark.process
+def test_a_saved_map_gives_the_same_closures_in_a_new_process(tmp_path):
+    recognizer = _recognizer(read_only=False)
+    for frame in _frames(0, 0):
+        recognizer.process(frame)
+    MapStore(tmp_path / "map", recognizer.describer.fingerprint).save(recognizer.database.snapshot())
+    recognizer.new_session()
+    recognizer.database.read_only = True
+    here = _closures(recognizer)
+    code = f"from test.maps.test_closures import visit; visit({str(tmp_path / 'map')!r})"
+    there = json.loads(subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout)
+    assert len(here) == len(there) >= 8
+    for ours, theirs in zip(here, there, strict=True):
+        assert ours[:4] == theirs[:4]
+        np.testing.assert_allclose(ours[4:], theirs[4:], atol=1e-6)
+    assert [c[0] for c in here if c[3]]  # some are closures
+    assert {c[2] for c in here} == {0}
