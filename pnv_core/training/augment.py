@@ -37,15 +37,17 @@ class Camera:
     field_of_view: float
 
 
-def flat_view(source: Pixels, size: tuple[int, int], strength: float, mirror: bool, rng: Rng) -> View:
+def flat_view(
+    source: Pixels, size: tuple[int, int], strength: float, mirror: bool, rng: Rng, advance: float = 1.0
+) -> View:
     """A view of a photograph: homography, crop and a smooth parallax-like displacement; `strength` 0 shows it as it is.
 
-    `size` is (width, height) of the view.
+    `size` is (width, height) of the view; `advance` magnifies, as going forward does.
     """
     width, height = size
     unit = _node_grid(width, height)  # (n, m, 2) in [-0.5, 0.5]
     points = unit.reshape(-1, 2)
-    zoom = np.exp(rng.uniform(-0.55, 0.12) * strength)  # < 1 looks at less of the source
+    zoom = np.exp(rng.uniform(-0.25, 0.08) * strength) / advance  # < 1 looks at less of the source
     stretch = np.exp(rng.normal(0, 0.08) * strength)
     angle = np.deg2rad(rng.normal(0, 6) * strength)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
@@ -53,7 +55,7 @@ def flat_view(source: Pixels, size: tuple[int, int], strength: float, mirror: bo
     points = (points * aspect) @ turn.T / aspect * zoom * np.array([stretch, 1 / stretch])
     tilt = rng.normal(0, 0.22, 2) * strength
     points = points / (1 + points @ tilt)[:, None]
-    slack = max(0.08, (1 - zoom) / 2 + 0.1) * strength
+    slack = 0.16 * zoom * strength
     points = points + rng.uniform(-slack, slack, 2) * np.array([1.0, 0.7])
     points = points.reshape(unit.shape) + _parallax(unit.shape[:2], 0.02 * strength, rng)
     if mirror:
@@ -110,8 +112,8 @@ def relight(pixels: Pixels, strength: float, rng: Rng, occluder: Pixels | None =
         image = cv2.GaussianBlur(image, (0, 0), sigma)
     elif rng.random() < 0.2 * strength:
         image = _motion_blur(image, rng)
-    if rng.random() < 0.25 * strength:
-        image = _thumbnail(image, rng)
+    if rng.random() < 0.15 * strength:
+        image = thumbnail(image, int(rng.integers(72, 180)))
     if rng.random() < 0.35 * strength:
         image = _noisy(image, rng.uniform(3, 16), rng)
     if rng.random() < 0.25 * strength:
@@ -234,10 +236,9 @@ def _motion_blur(image: Pixels, rng: Rng) -> Pixels:
     return cv2.filter2D(image, -1, kernel / kernel.sum())
 
 
-def _thumbnail(image: Pixels, rng: Rng) -> Pixels:
+def thumbnail(image: Pixels, small_width: int) -> Pixels:
     """As if it had been stored far too small."""
     height, width = image.shape[:2]
-    small_width = int(rng.integers(72, 180))
     small = cv2.resize(image, (small_width, max(1, small_width * height // width)), interpolation=cv2.INTER_AREA)
     return cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR)
 

@@ -4,18 +4,21 @@ P places, V views of each, B = P * V images of H x W; h x w cells.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pnv_core.training.augment import Camera, View, flat_view, panorama_view, relight
+from pnv_core.training.augment import Camera, View, flat_view, panorama_view, relight, thumbnail
 from pnv_core.training.sources import DEFAULT_RULE, RULES, PlaceImage, relation
 
-PANORAMA_WEIGHT = 5.0  # a panorama holds this many times more views than a photograph
-_SAME_YAW, _OTHER_YAW = np.deg2rad(25), np.deg2rad(75)
+PANORAMA_WEIGHT = 12.0  # a panorama holds this many times more views than a photograph
+_SAME_YAW, _OTHER_YAW = np.deg2rad(20), np.deg2rad(75)
+_FORWARD = 1.6  # magnification that makes a place another one: a revisit closes a loop where the robot stood
+_SAME_ADVANCE, _OTHER_ADVANCE = 1.2, 1.5
+_SMALL_WIDTH = (72, 140)  # pixels
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,8 @@ class BatchOptions:
     neighbours: int = 4
     sizes: tuple[tuple[int, int], ...] = ((320, 240),)  # (width, height), one drawn per batch
     strength: float = 1.0
+    forward: float = 0.5  # share of the groups of neighbours in which places lie in front of one another
+    thumbnails: float = 0.2  # share of the batches whose views all were stored small
     seed: int = 0
 
 
@@ -52,11 +57,12 @@ class Batches(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a view comes from: which image, the yaw of a panorama view, and whether the world is mirrored."""
+    """Where a view comes from: which image, the yaw of a panorama view, whether the world is mirrored, how magnified."""
 
     image: PlaceImage
     yaw: float
     mirror: bool
+    advance: float = 1.0
 
 
 class PlaceBatches:
@@ -92,9 +98,13 @@ class PlaceBatches:
         """Batch `number` before it is assembled; the first view of each place is the mildest."""
         rng = np.random.default_rng([self.options.seed, number, 1])
         size = self.options.sizes[int(rng.integers(len(self.options.sizes)))]
+        small = rng.random() < self.options.thumbnails
         origins = self.origins(number)
         strengths = [self.options.strength * (1.0 if v % self.options.views else 0.5) for v in range(len(origins))]
-        return origins, [self._view(o, size, s, rng) for o, s in zip(origins, strengths, strict=True)]
+        views = [self._view(o, size, s, rng) for o, s in zip(origins, strengths, strict=True)]
+        if small:
+            views = [replace(v, pixels=thumbnail(v.pixels, int(rng.integers(*_SMALL_WIDTH)))) for v in views]
+        return origins, views
 
     def _places(self, rng: np.random.Generator) -> list[Origin]:
         """The anchors of a batch: groups of neighbours from one sequence or panorama."""
@@ -103,32 +113,35 @@ class PlaceBatches:
             first = int(rng.choice(len(self.images), p=self.odds))
             mirror = bool(rng.random() < 0.5)
             count = min(self.options.neighbours, self.options.places - len(anchors))
+            advances = (1.0, _FORWARD) if count > 1 and rng.random() < self.options.forward else (1.0,)
+            spots = -(-count // len(advances))
             if self.images[first].panorama:
                 start = rng.uniform(0, 2 * np.pi)
-                anchors += [Origin(self.images[first], start + i * 2 * np.pi / count, mirror) for i in range(count)]
-                continue
-            members = self.sequences[self.images[first].sequence]
-            members = [m for m in members if not self.images[m].panorama]
-            chosen = {first, *(int(m) for m in rng.choice(members, min(count, len(members)), replace=False))}
-            anchors += [Origin(self.images[m], 0.0, mirror) for m in sorted(chosen)[:count]]
+                group = [Origin(self.images[first], start + i * 2 * np.pi / spots, mirror) for i in range(spots)]
+            else:
+                members = [m for m in self.sequences[self.images[first].sequence] if not self.images[m].panorama]
+                chosen = {first, *(int(m) for m in rng.choice(members, min(spots, len(members)), replace=False))}
+                group = [Origin(self.images[m], 0.0, mirror) for m in sorted(chosen)[:spots]]
+            anchors += [replace(origin, advance=a) for origin in group for a in advances][:count]
         return anchors
 
     def _near(self, anchor: Origin, rng: np.random.Generator) -> Origin:
         """Another view's origin at the anchor's place: the same image or a positive of it."""
         if anchor.image.panorama:
-            return Origin(anchor.image, anchor.yaw + rng.uniform(-_SAME_YAW, _SAME_YAW), anchor.mirror)
+            return replace(anchor, yaw=anchor.yaw + rng.uniform(-_SAME_YAW, _SAME_YAW))
         members = self.sequences[anchor.image.sequence]
         others = [m for m in members if relation(anchor.image, self.images[m]) > 0] if rng.random() < 0.6 else []
-        return Origin(self.images[int(rng.choice(others))], 0.0, anchor.mirror) if others else anchor
+        return replace(anchor, image=self.images[int(rng.choice(others))]) if others else anchor
 
     def _view(self, origin: Origin, size: tuple[int, int], strength: float, rng: np.random.Generator) -> View:
         if origin.image.panorama:
-            field_of_view = float(np.deg2rad(rng.uniform(55, 95)))
+            reach = np.tan(np.deg2rad(rng.uniform(75, 92)) / 2) / origin.advance
+            field_of_view = 2 * float(np.arctan(reach))
             pitch, roll = rng.normal(0, 0.12) * strength, rng.normal(0, 0.06) * strength
             camera = Camera(origin.yaw, pitch, roll, field_of_view)
             view = panorama_view(origin.image.rgb, size, camera, strength, origin.mirror, rng)
         else:
-            view = flat_view(origin.image.rgb, size, strength, origin.mirror, rng)
+            view = flat_view(origin.image.rgb, size, strength, origin.mirror, rng, origin.advance)
         occluder = self.images[int(rng.integers(len(self.images)))].rgb
         return View(relight(view.pixels, strength, rng, occluder), view.coordinates)
 
@@ -156,4 +169,7 @@ def _relation(a: Origin, b: Origin) -> int:
         known = 1 if gap <= 2 * _SAME_YAW else -1 if gap >= _OTHER_YAW else 0
     if known >= 0 and a.mirror != b.mirror:
         return 0
+    ratio = max(a.advance, b.advance) / min(a.advance, b.advance)
+    if known > 0 and ratio > _SAME_ADVANCE:
+        return -1 if ratio >= _OTHER_ADVANCE else 0
     return known

@@ -42,11 +42,11 @@ RULES: dict[str, SetRule] = {
     "polyhaven_hdri": SetRule(weight=0.4),
     "wosevision_campus_tour": SetRule(alias=r"([a-z]+)-.*", weight=0.4),
     "rc_patio_laps": SetRule(weight=0.5),
-    "tum_rgbd_fr1": SetRule(same=4, weight=0.5),
+    "tum_rgbd_fr1": SetRule(same=4, weight=0.3),
     "udacity_highway": SetRule(same=1, other=15, weight=0.7),
     "rtabmap_corridor": SetRule(weight=1.0),
     "opensfm_lund_berlin": SetRule(weight=1.0),
-    "icl_office_kt3_synth": SetRule(same=5, weight=0.6),
+    "icl_office_kt3_synth": SetRule(same=5, weight=0.35),
     "ikuta_campus_loop": SetRule(other=2, weight=1.5),
 }
 
