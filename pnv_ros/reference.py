@@ -121,6 +121,10 @@ row padding and byte order are honoured, 16 bit grey is scaled by the bits in us
 16 bit. Sides are 16 to 16384 pixels, 64 megapixels at most; a compressed image is measured by its header before
 anything is unpacked.
 
+Uncompressed images of more than a few hundred kilobytes need a larger shared memory segment than Fast DDS has by
+default: set `FASTRTPS_DEFAULT_PROFILES_FILE` to `config/fastdds_shared_memory.xml` for camera and node, or send
+compressed images.
+
 The QoS of each image topic can be set by rclpy's overrides
 (`qos_overrides./camera/image_raw.subscription.reliability: reliable`): {overridable}. A publisher that does not
 match is reported with both profiles and the override to set.

@@ -25,6 +25,16 @@ ENCODINGS = {
 }
 
 
+def image_message(bgr: np.ndarray, encoding: str) -> Image | CompressedImage:
+    if encoding not in ENCODINGS:
+        data = cv2.imencode("." + encoding, bgr)[1].tobytes()
+        return CompressedImage(format=encoding, data=array("B", data))
+    pixels = ENCODINGS[encoding](bgr)
+    height, width = pixels.shape[:2]
+    data = array("B", pixels.tobytes())
+    return Image(encoding=encoding, height=height, width=width, step=pixels[0].nbytes, data=data)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--topic", default="camera/image_raw")
@@ -33,14 +43,14 @@ def main() -> int:
     parser.add_argument("--encoding", default="bgr8")  # of ENCODINGS, or jpeg, png
     parser.add_argument("--reliable", action="store_true")
     parser.add_argument("--size", default="320x240")  # of noise
+    parser.add_argument("--same", action="store_true")  # one picture again and again, for speed
     parser.add_argument("--linger", type=float, default=1.0)
     args = parser.parse_args()
 
-    compressed = args.encoding in ("jpeg", "png")
     rclpy.init()
     node = rclpy.create_node("camera_driver")
     reliability = QoSReliabilityPolicy.RELIABLE if args.reliable else QoSReliabilityPolicy.BEST_EFFORT
-    kind = CompressedImage if compressed else Image
+    kind = Image if args.encoding in ENCODINGS else CompressedImage
     publisher = node.create_publisher(kind, args.topic, QoSProfile(depth=5, reliability=reliability))
     give_up = time.monotonic() + 30
     while not publisher.get_subscription_count():
@@ -54,22 +64,12 @@ def main() -> int:
     with open(args.stamps, newline="") as file:
         rows = [(int(stamp), path) for stamp, path in csv.reader(file)]
     due = time.monotonic()
+    message = None
     for number, (stamp_ns, path) in enumerate(rows):
-        if path:
-            bgr = cv2.imread(path)
-        else:
-            bgr = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
-        message = kind()
+        if message is None or not args.same:
+            noise = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
+            message = image_message(cv2.imread(path) if path else noise, args.encoding)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        if compressed:
-            message.format = args.encoding
-            message.data = array("B", cv2.imencode("." + args.encoding, bgr)[1].tobytes())
-        else:
-            pixels = ENCODINGS[args.encoding](bgr)
-            message.encoding = args.encoding
-            message.height, message.width = pixels.shape[:2]
-            message.step = pixels[0].nbytes
-            message.data = array("B", pixels.tobytes())
         publisher.publish(message)
         due += 1.0 / args.rate
         time.sleep(max(0.0, due - time.monotonic()))

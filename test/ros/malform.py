@@ -1,0 +1,125 @@
+"""A broken camera: publishes malformed messages made by hypothesis, a good image after every so many.
+
+python -m test.ros.malform --count 10000 --good-every 100
+Prints: offered N malformed and M good
+"""
+
+import argparse
+import struct
+import sys
+import time
+import zlib
+from array import array
+
+import cv2
+import rclpy
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from sensor_msgs.msg import CompressedImage, Image
+
+from msg_adapters.images import ENCODINGS
+from test.ros.camera import EPOCH_S, RELIABLE, compressed, image, scene
+
+PACE_S = 0.002  # the node unpacks and refuses one in less
+GOOD_PACE_S = 0.6  # and recognises one in less
+
+
+def png_claiming(width: int, height: int) -> bytes:
+    """A small file that unpacks to this size."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(bytes(100_000))) + chunk(b"IEND", b"")
+
+
+def images() -> st.SearchStrategy[Image]:
+    sizes = st.one_of(st.integers(0, 64), st.integers(0, 2**32 - 1))
+    return st.builds(
+        Image,
+        encoding=st.one_of(st.sampled_from(sorted(ENCODINGS)), st.text(st.characters(codec="ascii"), max_size=12)),
+        width=sizes,
+        height=sizes,
+        step=st.one_of(st.integers(0, 256), st.integers(0, 2**32 - 1)),
+        is_bigendian=st.integers(0, 255),
+        data=st.binary(max_size=20_000).map(lambda b: array("B", b)),
+    )
+
+
+def files() -> st.SearchStrategy[bytes]:
+    jpeg, png = (cv2.imencode(e, scene(0))[1].tobytes() for e in (".jpg", ".png"))
+
+    def damaged(data: bytes, at: float, junk: bytes) -> bytes:
+        start = int(at * len(data))
+        return data[:start] + junk + data[start + len(junk) :]
+
+    whole = st.sampled_from([jpeg, png])
+    return st.one_of(
+        st.binary(max_size=2000),
+        st.builds(lambda data, share: data[: int(share * len(data))], whole, st.floats(0, 1)),
+        st.builds(damaged, whole, st.floats(0, 1), st.binary(min_size=1, max_size=64)),
+        st.binary(max_size=500).map(lambda b: b"\xff\xd8\xff" + b + b"\xff\xd9"),
+        st.builds(png_claiming, st.integers(0, 2**31 - 1), st.integers(0, 2**31 - 1)),
+    )
+
+
+def compressed_images() -> st.SearchStrategy[CompressedImage]:
+    names = st.one_of(st.sampled_from(["jpeg", "png", "rgb8; jpeg compressed bgr8", "16UC1; compressedDepth png"]),
+                      st.text(st.characters(codec="ascii"), max_size=30))  # fmt: skip
+    return st.builds(CompressedImage, format=names, data=files().map(lambda b: array("B", b)))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--count", type=int, default=300)
+    parser.add_argument("--good-every", type=int, default=50)
+    args = parser.parse_args()
+    rclpy.init()
+    node = rclpy.create_node("broken_camera")
+    publishers = {
+        Image: node.create_publisher(Image, "raw", RELIABLE),
+        CompressedImage: node.create_publisher(CompressedImage, "packed/compressed", RELIABLE),
+    }
+    while not all(p.get_subscription_count() for p in publishers.values()):
+        time.sleep(0.05)
+    time.sleep(0.5)
+    stamp_ns, offered, good = EPOCH_S * 10**9, 0, 0
+
+    def good_ones() -> None:
+        nonlocal stamp_ns, good
+        time.sleep(GOOD_PACE_S)  # nothing waits in the slot
+        for make, kind in ((image, Image), (compressed, CompressedImage)):
+            stamp_ns += 10**9
+            publishers[kind].publish(make(scene(good), stamp_ns))
+            time.sleep(GOOD_PACE_S)
+            good += 1
+
+    @settings(max_examples=args.count, deadline=None, database=None, phases=[Phase.generate],
+              suppress_health_check=list(HealthCheck))  # fmt: skip
+    @given(
+        message=st.one_of(images(), compressed_images()),
+        stamp=st.one_of(st.none(), st.none(), st.none(), st.integers(0, EPOCH_S)),
+        frame_id=st.text(st.characters(codec="ascii"), max_size=20),
+    )
+    def offer(message: Image | CompressedImage, stamp: int | None, frame_id: str) -> None:
+        nonlocal stamp_ns, offered
+        stamp_ns += 1000
+        seconds, nanoseconds = divmod(stamp_ns, 10**9)
+        message.header.stamp.sec, message.header.stamp.nanosec = (seconds, nanoseconds) if stamp is None else (stamp, 0)
+        message.header.frame_id = frame_id
+        publishers[type(message)].publish(message)
+        offered += 1
+        time.sleep(PACE_S)
+        if offered % args.good_every == 0:
+            good_ones()
+
+    offer()
+    good_ones()
+    time.sleep(1.0)
+    print(f"offered {offered} malformed and {good} good")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
