@@ -112,7 +112,7 @@ def fit(shared: Path, describer: Describer, cache: Path, names: tuple[str, ...])
     """The calibration of the sets that may train a shipped model; every set counts the same."""
     evidence, truth, weights = [], [], []
     for name in names:
-        found = judged(sequence(name, shared), describer, cache, verify=10, consistency=0, accept_score=1.0)
+        found = judged(sequence(name, shared), describer, cache, verify=4, consistency=0, accept_score=1.0)
         e, t = examples(found)
         evidence += e
         truth += t

@@ -99,6 +99,7 @@ class Reason(StrEnum):
     UNCONFIRMED = "unconfirmed"
     ODOMETRY = "odometry"
     NOT_RERANKED = "not_reranked"
+    NOT_VERIFIED = "not_verified"
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ WANTED = 3
 
 
 def closure(query, match, score=0.9, session=0, camera="front"):
-    return LoopClosure(
-        ImageRef(query, query * 10**9, "front", session), ImageRef(match, match * 10**9, camera), score, 0.5, 0.5, 50, False
-    )
+    here, there = ImageRef(query, query * 10**9, "front", session), ImageRef(match, match * 10**9, camera)
+    return LoopClosure(here, there, score, 0.5, 0.5, 50, False)
 
 
 def confirmations(found, wanted=WANTED):
