@@ -2,9 +2,10 @@
 
 import hashlib
 import json
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -227,11 +228,19 @@ class Evaluation:
             if pair in journal.done:
                 stored, seconds = journal.done[pair]
                 lookup = dict(zip(head.tolist(), stored, strict=True))
-                again = rerank(q, rankings[q], len(head), lambda _, r: lookup[r])
-                return q, "", Ranking(again.references, again.scores, again.reranked, seconds)
+                return q, "", replace(rerank(rankings[q], len(head), lookup.__getitem__), seconds=seconds)
             record = features.record(query_keys[q], dataset.queries[q])
-            others = {int(r): features.record(reference_keys[r], dataset.references[r]) for r in head}
-            return q, pair, rerank(q, rankings[q], len(head), lambda _, r: score(record, others[r]))
+            seconds = rankings[q].seconds
+
+            def scored(r: int) -> float:  # one reference at a time: a hundred of the largest preset fill 5 GB
+                nonlocal seconds
+                reference = features.record(reference_keys[r], dataset.references[r])
+                began = time.perf_counter()
+                value = score(record, reference)
+                seconds += time.perf_counter() - began
+                return value
+
+            return q, pair, replace(rerank(rankings[q], len(head), scored), seconds=seconds)
 
         with ThreadPoolExecutor(self.workers) as pool:
             done = _in_order(pool, one, len(rankings), 2 * self.workers)

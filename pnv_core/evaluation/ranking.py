@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-Scorer = Callable[[int, int], float]  # (query, reference) -> score, larger is better
 _BLOCK = 64  # queries per matrix product
 
 
@@ -62,15 +61,14 @@ def _largest(values: NDArray[np.float32], k: int) -> NDArray[np.int64]:
     return chosen[np.argsort(-values[chosen], kind="stable")].astype(np.int64)
 
 
-def rerank(query: int, ranking: Ranking, candidates: int, score: Scorer) -> Ranking:
-    """The ranking with its first `candidates` ordered by `score`; equal scores keep the order of retrieval."""
-    began = time.perf_counter()
+def rerank(ranking: Ranking, candidates: int, score: Callable[[int], float]) -> Ranking:
+    """The ranking with its first `candidates` ordered by their score; equal scores keep the order of retrieval."""
     head = ranking.references[:candidates]
-    scores = np.array([score(query, int(reference)) for reference in head], np.float64)
+    scores = np.array([score(int(reference)) for reference in head], np.float64)
     order = np.argsort(-scores, kind="stable")
     return Ranking(
         np.concatenate([head[order], ranking.references[candidates:]]),
         np.concatenate([scores[order], ranking.scores[candidates:]]),
         len(head),
-        ranking.seconds + time.perf_counter() - began,
+        ranking.seconds,
     )

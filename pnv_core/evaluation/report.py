@@ -154,10 +154,10 @@ def _charts(results: Sequence[MethodResult]) -> list[str]:
     labels = [r.method.label for r in results]
     depth = min(_CURVE_DEPTH, max(len(k.references) for r in results for k in r.rankings))
     curves = [
-        Series(name, [(n + 1, 100 * v) for n, v in enumerate(recall_curve(r, depth))])
+        Series(name, [(n + 1, 100 * v) for n, v in enumerate(recall_curve(r, depth)) if not math.isnan(v)])
         for name, r in zip(labels, results, strict=True)
     ]
-    lowest = min((p[1] for c in curves for p in c.points if not math.isnan(p[1])), default=0.0)
+    lowest = min((p[1] for c in curves for p in c.points), default=0.0)
     charts = [
         "<div><h3>Recall@N</h3>" + line_chart(curves, Axis("N", 1, max(depth, 2)), _percent_axis("recall", lowest))
     ]

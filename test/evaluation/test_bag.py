@@ -1,5 +1,6 @@
 """Evaluating a rosbag2: unpacked once, with the poses of its odometry."""
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -73,6 +74,27 @@ def test_a_bag_without_the_topic_names_those_it_has(bag: Path, tmp_path: Path) -
         unpacked(bag, tmp_path, "/front", None, 1.0, silent)
     with pytest.raises(PnvError, match="no such bag"):
         unpacked(tmp_path / "none", tmp_path, None, None, 1.0, silent)
+
+
+def test_a_bag_is_evaluated_by_one_command(bag: Path, tmp_path: Path) -> None:
+    small = [
+        "--image-width",
+        "160",
+        "--image-height",
+        "112",
+        "--patch-sizes",
+        "2",
+        "--threads",
+        "1",
+        "--scorer",
+        "rapid",
+    ]
+    rule = ["--radius-m", "1", "--angle-deg", "10", "--exclude-recent-s", "2", "--every-s", "1"]
+    given = ["--dataset", "bag", "--root", str(bag), "--method", "patchnetvlad", "--cache", str(tmp_path / "cache")]
+    assert main(["evaluate", *given, *rule, *small, "--out", str(tmp_path / "out")]) == 0
+    (row,) = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert (row["queries"], row["recall@1"]) == (2, 1.0)
+    assert "Path and best candidates" in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_pnv_run_reads_a_bag(bag: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Every data set layout on a miniature copy; ground truth and figures worked out by hand."""
 
 import csv
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from pnv_cli.main import main
 from pnv_core.config import Config
 from pnv_core.errors import PnvError
 from pnv_core.evaluation.datasets import Dataset, SequenceRule, open_dataset
@@ -141,6 +143,28 @@ def test_robotcar_inherits_the_pose_of_the_best_reference(tmp_path: Path) -> Non
     assert np.array(first.split()[1:], float) == pytest.approx([1, 0, 0, 0, 0, 0, 0])
     # R = quarter turn about z, c = (10, 0, 0): t = -R c = (0, -10, 0)
     assert np.array(second.split()[1:], float) == pytest.approx([half, 0, 0, half, 0, -10, 0])
+
+    small = [
+        "--image-width",
+        "160",
+        "--image-height",
+        "112",
+        "--patch-sizes",
+        "2",
+        "--threads",
+        "1",
+        "--method",
+        "netvlad",
+    ]
+    given = ["--dataset", "robotcar", "--root", str(tmp_path), "--cache", str(tmp_path / "cache"), *small]
+    assert main(["evaluate", *given, "--out", str(tmp_path / "train")]) == 0
+    rows = {r["condition"]: r for r in json.loads((tmp_path / "train" / "results.json").read_text())}
+    assert [rows[c]["within_0.5m_5deg"] for c in ("", "sun", "night")] == pytest.approx([2 / 4, 1, 1 / 3], abs=1e-5)
+    # the test list has names only: nothing to measure, but a file to submit and a report to look at
+    (tmp_path / "robotcar_v2_test.txt").write_text("night/rear/12.jpg\n")
+    assert main(["evaluate", *given, "--split", "test", "--out", str(tmp_path / "test")]) == 0
+    assert (tmp_path / "test" / "robotcar-seasons-v2_eval_netvlad.txt").read_text() == second + "\n"
+    assert "nan" not in (tmp_path / "test" / "report.html").read_text().split("<svg", 1)[1].split("data:image")[0]
 
 
 def test_cmu_queries_are_compared_within_their_slice(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from pnv_core.evaluation.ranking import rerank, retrieve
 from pnv_core.model_files import Model
 from pnv_core.netvlad import Projection
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.weights import DEFAULT_MODEL
 
 from .places import place, write
 
@@ -70,6 +71,8 @@ def test_every_method_finds_the_plain_revisits(dataset: Dataset, tmp_path: Path)
         else:
             assert found == 0.8, result.method.name
     by_name = {r.method.name: r for r in results}
+    (named,) = Evaluation(SMALL, tmp_path, silent).run(dataset, parse_methods(f"multi-ransac@{DEFAULT_MODEL}"))
+    assert answers([named]) == answers([by_name["multi-ransac"]])
     assert by_name["multi-ransac:16"].reference_bytes < by_name["multi-ransac"].reference_bytes
     assert by_name["netvlad"].reference_bytes == 4 * load_describer().model.global_dim
 
@@ -174,7 +177,7 @@ def test_reranking_orders_the_candidates_and_keeps_the_rest() -> None:
     (ranking,) = retrieve(
         np.eye(1, 4, dtype=np.float32), np.array([[4, 0, 0, 0], [3, 0, 0, 0], [2, 0, 0, 0]], np.float32), 3
     )
-    again = rerank(0, ranking, 2, lambda _, r: {0: 0.1, 1: 0.9}[r])
+    again = rerank(ranking, 2, {0: 0.1, 1: 0.9}.__getitem__)
     assert again.references.tolist() == [1, 0, 2]
     assert again.scores.tolist() == [0.9, 0.1, 2.0]
 
