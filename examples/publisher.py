@@ -18,14 +18,14 @@ from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo, Image
 
 from examples.sources import add_source_flags, named_frames
 from msg_adapters.loop_closures import to_time
 from msg_adapters.pictures import rgb_to_message
 from pnv_core.errors import PnvError
 
-IMAGE_TOPIC = "camera/image_raw"
+IMAGE_TOPIC, INFO_TOPIC = "camera/image_raw", "camera/camera_info"
 ODOMETRY_TOPIC = "odometry"
 BUSY = "dropped: busy"  # of the node's diagnostics
 _WAIT_FOR_LISTENERS_S = 60.0
@@ -47,6 +47,17 @@ def odometry_message(stamp_ns: int, pose: list[float]) -> Odometry:
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     position.x, position.y, position.z = pose[:3]
     orientation.x, orientation.y, orientation.z, orientation.w = pose[3:]
+    return message
+
+
+def camera_info(image: Image, intrinsics: str) -> CameraInfo:
+    """CameraInfo of an image without distortion."""
+    fx, fy, cx, cy = (float(value) for value in intrinsics.split(","))
+    message = CameraInfo(header=image.header, height=image.height, width=image.width, distortion_model="plumb_bob")
+    message.d = [0.0] * 5
+    message.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    message.p = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
     return message
 
 
@@ -83,6 +94,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_source_flags(parser)
     parser.add_argument("--playback", type=float, default=2.0, help="times faster than the stamps, at most; default 2")
+    parser.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="publish them as camera info")
     parser.add_argument("--odometry", type=Path, help="CSV of stamp_ns,x,y,z,qx,qy,qz,qw to publish as odometry")
     args = parser.parse_args()
     poses = read_odometry(args.odometry) if args.odometry else deque()
@@ -91,14 +103,17 @@ def main() -> int:
     reliable = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
     images = node.create_publisher(Image, IMAGE_TOPIC, reliable)
     odometry = node.create_publisher(Odometry, ODOMETRY_TOPIC, QoSProfile(depth=500))
+    info = node.create_publisher(CameraInfo, INFO_TOPIC, reliable) if args.intrinsics else None
     try:
-        _wait_for_listeners([images] + [odometry] * bool(poses))
+        _wait_for_listeners([images] + [odometry] * bool(poses) + [info] * bool(info))
         pace = Pace(node, args.playback)
         for name, frame in named_frames(args):
             message = rgb_to_message(frame.rgb, frame.stamp_ns, "camera")
             pace.wait(frame.stamp_ns)
             while poses and poses[0][0] <= frame.stamp_ns:
                 odometry.publish(odometry_message(*poses.popleft()))
+            if info is not None:
+                info.publish(camera_info(message, args.intrinsics))
             images.publish(message)
             print(json.dumps({"name": name, "stamp_ns": frame.stamp_ns, "sent": time.monotonic()}), flush=True)
         while poses:

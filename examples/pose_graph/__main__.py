@@ -23,7 +23,7 @@ from examples.pose_graph.graph import PoseGraph
 from examples.pose_graph.report import Result, plot, print_table, write_tables
 from examples.pose_graph.sequences import Array, Walk, walks
 from examples.processes import isolated_environment, node_process, publisher_process
-from examples.publisher import IMAGE_TOPIC
+from examples.publisher import IMAGE_TOPIC, INFO_TOPIC, ODOMETRY_TOPIC
 from pnv_core.errors import PnvError
 from pnv_core.types import LoopClosure
 
@@ -67,11 +67,15 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[Loop
     environment = isolated_environment()
     rclpy.init(args=[])
     back_end = BackEndNode(PoseGraph(walk.noise))
-    parameters = {"image_topics": [IMAGE_TOPIC], **walk.parameters}
+    parameters = {"image_topics": [IMAGE_TOPIC], "odometry_topic": ODOMETRY_TOPIC, **walk.parameters}
+    if walk.intrinsics:
+        parameters["camera_info_topics"] = [INFO_TOPIC]
     with tempfile.TemporaryDirectory() as folder:
         table = Path(folder) / "odometry.csv"
         _write_odometry(table, walk.stamps_ns, odometry)
         flags = [*walk.flags, "--playback", str(walk.playback), "--odometry", str(table)]
+        if walk.intrinsics:
+            flags += ["--intrinsics", ",".join(map(str, walk.intrinsics))]
         try:
             with (
                 node_process(environment, parameters, assignments, None) as node,
@@ -91,7 +95,7 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[Loop
             if len(back_end.back_end.stamps) != len(walk.stamps_ns):
                 count = len(back_end.back_end.stamps)
                 raise PnvError(f"{walk.name}: {count} of {len(walk.stamps_ns)} odometry messages arrived")
-            return list(back_end.back_end.used), back_end.back_end.graph.poses
+            return [closure for closure, _, _ in back_end.back_end.used], back_end.back_end.graph.poses
         finally:
             back_end.destroy_node()
             rclpy.try_shutdown()

@@ -1,6 +1,7 @@
 """A SLAM back end as a node: odometry and loop closures in, the corrected path out.
 
-Subscribes `odometry` (nav_msgs/Odometry) and `loop_closures`; publishes `corrected_path` (nav_msgs/Path).
+Subscribes `odometry` (nav_msgs/Odometry), `loop_closures` and, where the node measures them, the relative poses of
+closures; publishes `corrected_path` (nav_msgs/Path). The camera is taken to look ahead from the body's origin.
 """
 
 import time
@@ -8,7 +9,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 from numpy.typing import NDArray
 from rclpy.node import Node
@@ -16,11 +17,12 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from scipy.spatial.transform import Rotation
 from std_msgs.msg import Float64MultiArray
 
-from examples.listener import CLOSURES_QOS
+from examples.listener import CLOSURES_QOS, NODE
 from examples.pose_graph.graph import Loop, PoseGraph
 from msg_adapters.images import stamp_of
 from msg_adapters.loop_closures import closures_from_message, to_time
 from pnv_core.types import LoopClosure
+from pnv_core.worlds import CAMERA_IN_BODY
 
 Array = NDArray[np.float64]
 
@@ -36,9 +38,11 @@ class BackEnd:
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
         self.stamps: list[int] = []
-        self.used: list[LoopClosure] = []
+        self.used: list[tuple[LoopClosure, int, int]] = []  # with the nodes of query and match
         self.dropped: list[LoopClosure] = []
+        self.measured: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._waiting: list[LoopClosure] = []
+        self._fresh = False
 
     def add_odometry(self, stamp_ns: int, pose: Array) -> None:
         """A pose (4, 4); stamps that do not grow are ignored."""
@@ -50,6 +54,14 @@ class BackEnd:
     def add_closures(self, closures: Sequence[LoopClosure]) -> None:
         self._waiting += closures
 
+    def add_relative_pose(self, query_ns: int, match_id: int, camera: Array, covariance: Array) -> None:
+        """The query's camera (4, 4) in the match's optical frame, and its covariance (6, 6), position first."""
+        turn = np.eye(4)
+        turn[:3, :3] = CAMERA_IN_BODY
+        both = np.kron(np.eye(2), CAMERA_IN_BODY)
+        self.measured[query_ns, match_id] = turn @ camera @ turn.T, both @ covariance @ both.T
+        self._fresh = True
+
     def update(self) -> bool:
         """Take the closures whose poses are there and optimise; whether anything was new."""
         ready = [c for c in self._waiting if self.stamps and c.query.stamp_ns <= self.stamps[-1]]
@@ -59,11 +71,16 @@ class BackEnd:
             if query is None or match is None:
                 self.dropped.append(closure)
             else:
-                self.used.append(closure)
-                self.graph.add_loop(Loop(query, match, closure.score))
-        if ready:
+                self.used.append((closure, query, match))
+        changed = bool(ready) or self._fresh
+        if changed:
+            self._fresh = False
+            self.graph.loops = [
+                Loop(query, match, c.score, *self.measured.get((c.query.stamp_ns, c.match.id), (None, None)))
+                for c, query, match in self.used
+            ]
             self.graph.optimise()
-        return bool(ready)
+        return changed
 
     def nearest(self, stamp_ns: int) -> int | None:
         """The node nearest in time; None where it is too far."""
@@ -83,6 +100,7 @@ class BackEndNode(Node):
         self._path = self.create_publisher(Path, "corrected_path", _PATH_QOS)
         self.create_subscription(Odometry, "odometry", self._odometry, QoSProfile(depth=500))
         self.create_subscription(Float64MultiArray, "loop_closures", self._closures, CLOSURES_QOS)
+        self.create_subscription(PoseWithCovarianceStamped, f"{NODE}/relative_pose", self._relative_pose, 50)
         self.create_timer(1.0, self._correct_if_due)
         self._due = 0.0  # of the monotonic clock
 
@@ -92,6 +110,11 @@ class BackEndNode(Node):
     def _closures(self, message: Float64MultiArray) -> None:
         self.messages += 1
         self.back_end.add_closures(closures_from_message(message))
+
+    def _relative_pose(self, message: PoseWithCovarianceStamped) -> None:
+        match_id = int(message.header.frame_id.rpartition("_")[2])
+        covariance = np.reshape(message.pose.covariance, (6, 6))
+        self.back_end.add_relative_pose(stamp_of(message), match_id, pose_matrix(message), covariance)
 
     def _correct_if_due(self) -> None:
         start = time.monotonic()
@@ -112,8 +135,8 @@ class BackEndNode(Node):
             self._path.publish(path_message(self.back_end.stamps, self.back_end.graph.poses))
 
 
-def pose_matrix(message: Odometry) -> Array:
-    """(4, 4) pose of an Odometry message."""
+def pose_matrix(message: Odometry | PoseWithCovarianceStamped) -> Array:
+    """(4, 4) pose of a message that has one."""
     position, orientation = message.pose.pose.position, message.pose.pose.orientation
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat([orientation.x, orientation.y, orientation.z, orientation.w]).as_matrix()

@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from examples.pose_graph.drift import Drift
 from examples.pose_graph.graph import Noise
-from pnv_core.worlds import Pose, loop_sequence
+from pnv_core.worlds import Camera, Pose, loop_sequence
 
 Array = NDArray[np.float64]
+
+
+_ICL_CAMERA = (481.2, 480.0, 319.5, 239.5)  # of the ICL-NUIM data set's page, 640x480
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +31,7 @@ class Walk:
     drift: Drift
     noise: Noise
     parameters: dict[str, Any] = field(default_factory=dict)
+    intrinsics: tuple[float, float, float, float] | None = None  # fx, fy, cx, cy in pixels, where they are known
 
 
 def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -> Walk:
@@ -35,7 +39,11 @@ def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -
     sequence = loop_sequence(seed, kind, laps=laps, speed_m_s=speed, fps=2.0)
     flags = ["--world", kind, "--seed", str(seed), "--laps", str(laps), "--speed", str(speed)]
     noise = Noise(tolerance_m=tolerance_m)
-    return Walk(f"{kind} {seed}", flags, list(sequence.stamps_ns), sequence.matrices, 2.0, Drift(), noise)
+    k = Camera(*sequence.size).matrix()
+    intrinsics = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    return Walk(
+        f"{kind} {seed}", flags, list(sequence.stamps_ns), sequence.matrices, 2.0, Drift(), noise, {}, intrinsics
+    )
 
 
 def icl_office(folder: Path) -> Walk:
@@ -52,7 +60,7 @@ def icl_office(folder: Path) -> Walk:
     drift = Drift(deg_per_m=0.0, turn=0.08)
     parameters = {"exclude_recent_s": 15.0, "min_interval_s": 0.3}
     noise = Noise(tolerance_m=0.3, tolerance_deg=10.0)
-    return Walk("icl_office_kt3", _flags(folder), stamps, truth, 0.7, drift, noise, parameters)
+    return Walk("icl_office_kt3", _flags(folder), stamps, truth, 0.7, drift, noise, parameters, _ICL_CAMERA)
 
 
 def ikuta_campus(folder: Path) -> Walk:

@@ -15,7 +15,7 @@ Image = NDArray[np.uint8]
 
 NEAR_M = 0.05
 _SUBPIXEL = 4  # bits of fillConvexPoly's fixed point
-_CAMERA_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes as columns
+CAMERA_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # camera axes as columns
 _UNIT_SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
@@ -62,7 +62,7 @@ class Camera:
     def project(self, points: Array, pose: Pose) -> tuple[Array, Array]:
         """World points (N, 3) -> pixels (N, 2) as (x, y) and depths (N,) along the optical axis."""
         body = pose.matrix()
-        local = (points - body[:3, 3]) @ (body[:3, :3] @ _CAMERA_IN_BODY)
+        local = (points - body[:3, 3]) @ (body[:3, :3] @ CAMERA_IN_BODY)
         pixels = local @ self.matrix().T
         return pixels[:, :2] / pixels[:, 2:], local[:, 2]
 
@@ -108,7 +108,7 @@ def rasterise(surfaces: list[Surface], pyramids: list[list[Image]], camera: Came
     """The scene as the camera sees it, (H, W, 3). `pyramids` holds the lit texture levels of every surface."""
     body = pose.matrix()
     eye = body[:3, 3]
-    world_to_camera = (body[:3, :3] @ _CAMERA_IN_BODY).T
+    world_to_camera = (body[:3, :3] @ CAMERA_IN_BODY).T
     project = camera.matrix() @ world_to_camera
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     nearness = np.zeros((camera.height, camera.width), np.float32)  # inverse depth of what is drawn
