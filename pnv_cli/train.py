@@ -41,7 +41,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--clusters", type=int, default=16, help="K (default 16)")
     parser.add_argument("--neck", type=int, default=128, help="channels after the compact trunk (default 128)")
     parser.add_argument("--global-dim", type=int, default=512)
-    parser.add_argument("--patch-dim", type=int, default=64)
+    parser.add_argument("--patch-dim", type=int, default=128)
     parser.add_argument("--size", default="320x240", help="input size of the compact model (default 320x240)")
     parser.add_argument("--view", default="256x192", help="size of the views it is trained on (default 256x192)")
     parser.add_argument("--places", type=int, default=40, help="places a batch (default 40)")
@@ -79,7 +79,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     from pnv_core.training.trainer import Trainer, TrainOptions
 
     given = {"seed": args.seed} if args.seed is not None else {}
-    options = _options(TrainOptions, args.set, **({"frozen_layers": 11} if args.pool else {}), **given)
+    options = _options(TrainOptions, args.set, **given)
     size, view = _size(args.size), _size(args.view)
     trained, held = _split(args.data)
     trunk = imagenet_trunk(args.imagenet, fires=8, relu=True)

@@ -59,9 +59,11 @@ class FeaturePool:
         self.maps = _array(self.folder / "maps.npy", (count, *shape))
         self.coordinates = _array(self.folder / "coordinates.npy", (count, *shape[1:], 3))
 
-    def mild_maps(self) -> Iterable[Tensor]:
-        """The first view of every place: (C', h, w) each."""
-        for row in range(0, len(self.maps), self.batches.options.views):
+    def mild_maps(self, most: int = 1500) -> Iterable[Tensor]:
+        """The first views of at most so many places, evenly drawn: (C', h, w) each."""
+        views = self.batches.options.views
+        places = len(self.maps) // views
+        for row in views * np.unique(np.linspace(0, places - 1, min(most, places)).astype(int)):
             yield torch.from_numpy(np.asarray(self.maps[row]))
 
     def __getitem__(self, number: int) -> Batch:

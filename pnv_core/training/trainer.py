@@ -30,21 +30,21 @@ from pnv_core.training.validation import ValidationSet, describe_all, recalls
 class TrainOptions:
     """Settings of a training. Learning rates are peaks of a cosine schedule with a linear start."""
 
-    steps: int = 1500
-    trunk_lr: float = 1e-4
+    steps: int = 900
+    trunk_lr: float = 1.5e-4
     neck_lr: float = 3e-4
     vlad_lr: float = 1e-3
     projection_lr: float = 1e-3
     weight_decay: float = 1e-4
-    frozen_layers: int = 5  # leading layers of the trunk that keep their ImageNet weights
+    frozen_layers: int = 9  # leading layers of the trunk that keep their ImageNet weights
     patch_weight: float = 0.5  # of the patches' loss
-    patch_pairs: int = 12  # image pairs of a batch that the patches' loss looks at
+    patch_pairs: int = 10  # image pairs of a batch that the patches' loss looks at
     patch_sizes: tuple[int, ...] = (2, 3, 4, 5)  # one drawn per step
     patch_temperature: float = 0.07
     anchor: float = 0.0  # pull of the trunk towards where it started (L2-SP, Li et al., ICML 2018)
     average: float = 0.995  # decay of the running average of weights that is kept
     warmup: int = 50
-    validate_every: int = 100
+    validate_every: int = 450
     save_every: int = 50
     workers: int = 2  # threads that make batches
     mixed: bool = True  # bfloat16 where the trunk computes
