@@ -86,7 +86,12 @@ class Config:
 
     # Re-ranking
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
-    match_mode: str = setting("exact", "exact, or coarse-to-fine matching of candidates", choices=("exact", "coarse"))
+    match_mode: str = setting(
+        "exact",
+        "exact: score every candidate; bounded: none that provably cannot be best; coarse: none that hardly can",
+        choices=("exact", "bounded", "coarse"),
+    )
+    match_keep: float = setting(0.25, "share of the candidates that coarse matching scores in full", low=0.0, high=1.0)
 
     verify: int = setting(3, "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept", low=0, high=100)
 

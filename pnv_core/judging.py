@@ -9,7 +9,7 @@ from pnv_core.calibration import Calibration, calibration_for
 from pnv_core.config import Config
 from pnv_core.local_features import Verifier, hull_area
 from pnv_core.reranker import Reranker, SpatialResult
-from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor
+from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
 
 _NEIGHBOURS = 10  # keyframes this close in number show one place
 
@@ -31,16 +31,23 @@ class Judge:
         predecessor: float,
         candidates: Sequence[Candidate],
         config: Config,
+        limit: int | None = None,
     ) -> list[LoopClosure]:
         """A LoopClosure per candidate, best first, none accepted yet.
+
+        Those beyond the first `limit`, and those the re-ranker leaves out, are refused as not re-ranked.
 
         `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
         `config.verify` best are examined by local features where both images have a thumbnail. An image with less
         texture than `config.min_texture` scores 0.
         """
-        results = [self.reranker.score(descriptor, reference) for _, _, reference in candidates]
+        examined = candidates[:limit]
+        results = self.reranker.scores(descriptor, [reference for _, _, reference in examined])
+        scored = {i: result for i, result in enumerate(results) if result is not None}
+        left_out = [i for i in range(len(candidates)) if i not in scored]
         found = []
-        for number, ((ref, similarity, reference), result) in enumerate(zip(candidates, results, strict=True)):
+        for number, result in scored.items():
+            ref, similarity, reference = candidates[number]
             elsewhere = [i for i, (other, _, _) in enumerate(candidates) if _apart(other, ref)]
             evidence = Evidence(
                 similarity=similarity,
@@ -50,7 +57,7 @@ class Judge:
                 distortion=distortion(descriptor, reference, result.matches),
                 lead=min((similarity - candidates[i][1] for i in elsewhere), default=0.0),
                 recent_lead=similarity - predecessor,
-                spatial_lead=min((result.score - results[i].score for i in elsewhere), default=0.0),
+                spatial_lead=min((result.score - scored[i].score for i in elsewhere if i in scored), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), number))
@@ -60,8 +67,16 @@ class Judge:
             if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
                 seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
-                found[place] = self._closure(query, closure.match, seen, results[number], config.min_texture), number
-        return sorted((closure for closure, _ in found), key=_rank)
+                found[place] = (
+                    self._closure(query, closure.match, seen, results[number], config.min_texture),
+                    number,
+                )
+        closures = [closure for closure, _ in found]
+        # what ranked lower and was not examined is not believed more than what was
+        most = max((c.score for c in closures if c.evidence.local_inliers >= 0), default=1.0)
+        closures = [c if c.evidence.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c in closures]
+        rest = [_not_reranked(query, *candidates[i], descriptor.texture) for i in left_out]
+        return sorted(closures + rest, key=_rank)
 
     def _closure(
         self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float
@@ -71,6 +86,13 @@ class Judge:
             query, match, score, evidence.similarity, result.score, result.inliers, False,
             matches=result.matches, evidence=evidence,
         )  # fmt: skip
+
+
+def _not_reranked(
+    query: ImageRef, match: ImageRef, similarity: float, reference: PlaceDescriptor, texture: float
+) -> LoopClosure:
+    evidence = Evidence(similarity=similarity, spatial=0.0, inliers=0, texture=min(texture, reference.texture))
+    return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
 
 
 def _rank(closure: LoopClosure) -> tuple[float, float, int]:

@@ -3,12 +3,14 @@
 import functools
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import cv2
 import threadpoolctl
+import torch
 
 T = TypeVar("T")
 
@@ -21,7 +23,7 @@ class Workers:
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="pnv") if threads > 1 else None
+        self._pool = _pool(threads) if threads > 1 else None
         self._limit = threadpoolctl.threadpool_limits(limits=1, user_api="blas")
         cv2.setNumThreads(1)
 
@@ -31,6 +33,23 @@ class Workers:
         if self._pool is None or len(parts) < 2:
             return [function(part) for part in parts]
         return list(self._pool.map(function, parts))
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
+    """Threads in which torch, too, works alone. torch sets both the calling thread's number and that of new threads."""
+    others = torch.get_num_threads()
+    started = threading.Barrier(threads)
+
+    def start() -> None:
+        torch.get_num_threads()  # takes the number of new threads, which would otherwise come later and win
+        torch.set_num_threads(1)
+        started.wait()
+
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="pnv")
+    for done in [pool.submit(start) for _ in range(threads)]:
+        done.result()
+    torch.set_num_threads(others)
+    return pool
 
 
 @functools.cache

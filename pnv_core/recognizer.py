@@ -10,7 +10,7 @@ from pnv_core.judging import Judge
 from pnv_core.keyframes import KeyframeSelector
 from pnv_core.local_features import thumbnail
 from pnv_core.odometry import Odometry
-from pnv_core.timing import StageTimer
+from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, ImageRef, LoopClosure, Reason
 
 
@@ -33,6 +33,7 @@ class PlaceRecognizer:
             database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
         self.database = database
         self.timer = timer or StageTimer()
+        self.budget = TimeBudget(self.timer.clock)
         self.keyframes = KeyframeSelector(config)
         self.judge = Judge(describer.config, describer.model.info.calibration)
         self.sequence = SequenceMemory()
@@ -45,6 +46,7 @@ class PlaceRecognizer:
         """
         if not self.keyframes.due(frame):
             return []
+        self.budget.start()
         with self.timer.stage("describe"):
             descriptor = self.describer.describe(frame.rgb, frame.valid)
         if not self.keyframes.differs(frame, descriptor):
@@ -59,10 +61,11 @@ class PlaceRecognizer:
             candidates = self.database.nearest(
                 descriptor.global_vector, self.config.candidates, frame.stamp_ns, recent_ns
             )
-        with self.timer.stage("rerank"):
+        limit = self.budget.affordable(len(candidates), self.config.time_budget_ms / 1e3)
+        with self.timer.stage("rerank"), self.budget.taken(limit):
             known = [(ref, similarity, self.database.descriptor(ref.id)) for ref, similarity in candidates]
             query = ImageRef(-1, frame.stamp_ns, frame.camera)
-            closures = self.judge.judged(query, descriptor, predecessor, known, self.config)
+            closures = self.judge.judged(query, descriptor, predecessor, known, self.config, limit)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
@@ -92,10 +95,14 @@ class PlaceRecognizer:
 
     def _decided(self, closure: LoopClosure) -> LoopClosure:
         config = self.config
+        if closure.reason is Reason.NOT_RERANKED:
+            return closure
         if closure.evidence.texture < config.min_texture:
             return replace(closure, reason=Reason.LOW_TEXTURE)
         if closure.score < config.accept_score:
             return replace(closure, reason=Reason.LOW_SCORE)
+        if config.verify and closure.evidence.local_inliers < 0:
+            return replace(closure, reason=Reason.NOT_VERIFIED)
         gate = config.odometry_drift, config.odometry_slack_m, config.min_travelled_m
         if self.odometry.impossible(closure.query, closure.match, *gate):
             return replace(closure, reason=Reason.ODOMETRY)

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 import numpy as np
 
 _KEPT = 1000  # latest durations kept per stage
+_REMEMBERED = 50  # latest frames that say what a candidate takes
+_CAUTION = 75  # percentile of those
 
 
 class StageTimer:
@@ -33,3 +35,35 @@ class StageTimer:
             name: (float(np.percentile(d, 50)) * 1e3, float(np.percentile(d, 95)) * 1e3)
             for name, d in ((n, list(v)) for n, v in list(self.durations.items()))
         }
+
+
+class TimeBudget:
+    """How many candidates the rest of a frame's time allows, going by what the latest ones took.
+
+    Without a clock, or with a budget of 0, all of them: only a driver that asks for it gives up determinism.
+    """
+
+    def __init__(self, clock: Callable[[], float] | None) -> None:
+        self._clock = clock
+        self._started = 0.0
+        self._each: deque[float] = deque(maxlen=_REMEMBERED)  # seconds per candidate
+
+    def start(self) -> None:
+        """The work on a frame begins."""
+        if self._clock is not None:
+            self._started = self._clock()
+
+    def affordable(self, candidates: int, budget_s: float) -> int:
+        """Of so many candidates, how many to re-rank; at least one."""
+        if self._clock is None or not budget_s or not self._each:
+            return candidates
+        left = budget_s - (self._clock() - self._started)
+        return max(1, min(candidates, int(left / float(np.percentile(self._each, _CAUTION)))))
+
+    @contextmanager
+    def taken(self, candidates: int) -> Iterator[None]:
+        """Around the re-ranking of so many candidates: remembers how long each took."""
+        before = self._clock() if self._clock is not None else 0.0
+        yield
+        if self._clock is not None and candidates:
+            self._each.append(max((self._clock() - before) / candidates, 1e-9))
