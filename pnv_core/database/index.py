@@ -60,10 +60,10 @@ class ExactIndex:
 class PqScanIndex:
     """Every similarity, approximately, from 2 bits per dimension; the exact ones of the best 1000 decide.
 
-    Product quantisation with 4-bit codes of dimension pairs (FAISS fast scan). Vectors are rotated at random, after
-    which every pair of a unit vector is nearly a 2-D Gaussian of variance 1 / D; so one codebook, that of the Gaussian,
-    serves every model and map: nothing is trained and nothing drifts. The code of row i lies at place i and is
-    overwritten in place when the row is reused.
+    Product quantisation with 4-bit codes of pairs (FAISS fast scan). Vectors are turned by random signs and a Fourier
+    transform, after which every pair of a unit vector is nearly a 2-D Gaussian of variance 1 / D; so one codebook, that
+    of the Gaussian, serves every model and map: nothing is trained and nothing drifts. The code of row i lies at place
+    i and is overwritten in place when the row is reused.
     """
 
     def __init__(self, table: VectorTable) -> None:
@@ -74,7 +74,7 @@ class PqScanIndex:
                 f"index = 'pq' with vectors of {dim} dimensions; allowed: an even number, or index = 'exact'"
             )
         self._table = table
-        self._rotation = np.linalg.qr(np.random.default_rng(2).standard_normal((dim, dim)))[0].astype(np.float32)
+        self._signs = np.random.default_rng(2).choice(np.array([-1, 1], np.float32), dim)
         self._codes = faiss.IndexPQFastScan(dim, dim // 2, 4, faiss.METRIC_INNER_PRODUCT)
         codebook = np.tile(_gaussian_codebook() / np.float32(np.sqrt(dim)), (dim // 2, 1))  # (D/2 * 16, 2)
         faiss.copy_array_to_vector(codebook.ravel(), self._codes.pq.centroids)
@@ -90,7 +90,7 @@ class PqScanIndex:
         rows = self.rows + more
         needed = -(-rows // self._packer.nvec) * self._packer.block_size
         allocated = 1 << max(needed - 1, 1).bit_length()  # FAISS grows the code table by doubling
-        return self._rotation.nbytes + allocated
+        return self._signs.nbytes + allocated
 
     def add(self, slot: int) -> None:
         if slot >= self.rows:
@@ -101,11 +101,21 @@ class PqScanIndex:
     def encode_up_to(self, rows: int) -> None:
         """Encode the rows of the table that are not yet, up to this many."""
         for start in range(self.rows, rows, 8192):
-            self._codes.add(self._table.vectors[start : min(rows, start + 8192)] @ self._rotation)
+            self._codes.add(self._turned(self._table.vectors[start : min(rows, start + 8192)]))
+
+    def _turned(self, vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(n, D) by an orthogonal map without a matrix: signs, then the real Fourier transform as D / 2 pairs."""
+        dim = vectors.shape[1]
+        bins = np.fft.rfft(vectors * self._signs, norm="ortho")  # (n, D / 2 + 1) complex
+        turned = np.empty((len(vectors), dim), np.float32)
+        turned[:, 0], turned[:, 1] = bins[:, 0].real, bins[:, -1].real  # the two bins that are real
+        turned[:, 2::2] = np.sqrt(2) * bins[:, 1:-1].real
+        turned[:, 3::2] = np.sqrt(2) * bins[:, 1:-1].imag
+        return turned
 
     def _overwrite(self, slot: int) -> None:
         faiss = _faiss()
-        code = self._codes.pq.compute_codes(self._table.vectors[slot : slot + 1] @ self._rotation)[0]
+        code = self._codes.pq.compute_codes(self._turned(self._table.vectors[slot : slot + 1]))[0]
         packed = faiss.rev_swig_ptr(self._codes.codes.get(), self._codes.codes.size())
         block, place = divmod(slot, self._packer.nvec)
         self._packer.pack_1(code, place, packed.reshape(-1, self._packer.block_size)[block : block + 1])
@@ -115,9 +125,9 @@ class PqScanIndex:
 
     def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
         examined = max(1000, 20 * k)
-        rotated = (query @ self._rotation)[None]
+        turned = self._turned(query[None])
         while 4 * examined < len(allowed):
-            found = self._codes.search(rotated, examined)[1][0]
+            found = self._codes.search(turned, examined)[1][0]
             found = found[(found >= 0) & (found < len(allowed))]
             found = found[allowed[found]]
             if len(found) >= max(k, examined // 4):

@@ -53,3 +53,6 @@ class Autosave:
             self._report(self.save_now())
         except MapError as error:
             self._report(error)
+        except Exception as error:  # a defect: say so before the thread ends, rather than never save again in silence
+            self._report(MapError(f"autosave has ended: {error!r}"))
+            raise

@@ -99,7 +99,9 @@ class MapStore:
             try:
                 manifest, report = self._write(snapshot, known)
             except OSError as error:
-                raise MapError(f"cannot save {self.path}: {error.strerror}; what was saved before is whole") from error
+                raise MapError(
+                    f"cannot save {self.path}: {error.strerror or error}; what was saved before is whole"
+                ) from error
         self._known, self._lineage = manifest, snapshot.lineage
         return report
 
