@@ -10,6 +10,7 @@ on the others. Descriptors are kept in a cache folder by the model's fingerprint
 import argparse
 import sys
 import tempfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,7 @@ class RememberedDescriber:
         self.at = 0
         folder = cache / f"{describer.fingerprint[:12]}_{self.config.image_width}x{self.config.image_height}"
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / f"{images.name}.npz"
+        file = folder / f"{images.name}_{zlib.crc32(chr(10).join(images.keys).encode()):08x}.npz"
         if not file.exists():
             described = [describer.describe(frame.rgb) for frame in images.frames()]
             patches = {
