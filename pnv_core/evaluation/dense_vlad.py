@@ -21,11 +21,11 @@ from pnv_core.model_files import Model, ModelInfo, make_trunk, save_model
 from pnv_core.netvlad import NetVLAD, Projection, alpha_rule
 from pnv_core.trunks import Trunk
 
-_IMAGES = 400  # evenly drawn from the references
+_IMAGES = 200  # evenly drawn from the references
 _CLUSTERS = 64
 _CELLS = 100  # drawn of each image for the vocabulary
 _DIMENSIONS = 512
-_PER_DIMENSION = 4  # images a principal direction is estimated from; with fewer, whitening blows up noise
+_PER_DIMENSION = 4  # images per principal direction; with fewer, whitening would blow up noise and is left out
 
 
 @torch.inference_mode()
@@ -34,7 +34,7 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
     rows = np.unique(np.linspace(0, len(references) - 1, min(_IMAGES, len(references))).round().astype(int))
     files = [references[i] for i in rows]
     size = (completed.image_width, completed.image_height)
-    drawn = [_CLUSTERS, _DIMENSIONS, size, *(content_key(f) for f in files)]
+    drawn = [_CLUSTERS, _DIMENSIONS, _PER_DIMENSION, size, *(content_key(f) for f in files)]
     target = cache / "densevlad" / f"{hashlib.sha256(json.dumps(drawn).encode()).hexdigest()[:24]}.safetensors"
     if target.is_file():
         return target
@@ -48,10 +48,10 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
     info = ModelInfo("rootsift", image_width=size[0], image_height=size[1], patch_sizes=(2,), patch_weights=(1.0,))
     model = Model(info, trunk, vocabulary, Projection(_CLUSTERS * trunk.channels, 1))
     vlads = torch.stack([multiscale_vlad(model, read_image(f), size) for f in shown(files, "PCA")])
-    dimensions = max(1, min(_DIMENSIONS, (len(files) - 1) // _PER_DIMENSION))
+    dimensions = max(1, min(_DIMENSIONS, len(files) - 1))
     projection = Projection(vlads.shape[1], dimensions)
     if len(files) > 1:
-        weight, bias = pca(vlads, dimensions, whiten=True)
+        weight, bias = pca(vlads, dimensions, whiten=len(files) >= _PER_DIMENSION * dimensions)
         projection.load_state_dict({"weight": weight, "bias": bias})
     save_model(Model(info, trunk, vocabulary, projection), target)
     return target
