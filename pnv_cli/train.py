@@ -213,7 +213,10 @@ def _size(text: str) -> tuple[int, int]:
 def _report(journal: Any, folder: Path, output: Path) -> None:
     from pnv_core.training.journal import plot
 
-    plot(journal, folder / "training.png")
+    try:
+        plot(journal, folder / "training.png")
+    except ImportError:
+        print(f"no plot: matplotlib is not installed; the figures are in {journal.metrics}")
     last = next((row for row in reversed(journal.rows()) if any("recall" in name for name in row)), {})
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; metrics and plot in {folder}")
     for name, value in last.items():

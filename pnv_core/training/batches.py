@@ -57,7 +57,7 @@ class Batches(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """Where a view comes from: which image, the yaw of a panorama view, whether the world is mirrored, how magnified."""
+    """Where a view comes from: the image, the yaw in a panorama, whether the world is mirrored, how magnified."""
 
     image: PlaceImage
     yaw: float
