@@ -23,13 +23,16 @@ from pnv_core.evaluation.store import DescriptorStore, Record, code_version, con
 from pnv_core.images import read_image
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
-_DESCRIBING = tuple(
-    f"pnv_core.{name}"
-    for name in (
-        "describer", "netvlad", "patches", "kernels", "trunks", "compact", "rootsift", "evaluation.extractors",
-        "evaluation.extraction", "evaluation.local_features",
-    )
-)  # fmt: skip
+_ALWAYS = ("pnv_core.describer", "pnv_core.evaluation.extractors", "pnv_core.evaluation.extraction")
+_TRUNKS = ("pnv_core.trunks", "pnv_core.compact", "pnv_core.rootsift", "pnv_core.netvlad")
+_CODE = {  # what a kind's records depend on beside _ALWAYS
+    "patchnetvlad": (*_TRUNKS, "pnv_core.patches", "pnv_core.kernels"),
+    "average": _TRUNKS,
+    "maximum": _TRUNKS,
+    "gem": _TRUNKS,
+    "densevlad": ("pnv_core.rootsift", "pnv_core.netvlad"),
+}
+_LOCAL = ("pnv_core.evaluation.local_features",)
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]  # (items, how many, what) -> the same items
 
 
@@ -97,7 +100,8 @@ class Describing:
     def __init__(self, extraction: Extraction, cache: Path, memory_mb: float = 256.0) -> None:
         self.extraction = extraction
         self.extractor = extraction.open()
-        identity = json.dumps([code_version(*_DESCRIBING), extraction.kind, self.extractor.fingerprint])
+        code = code_version(*_ALWAYS, *_CODE.get(extraction.kind, _LOCAL))
+        identity = json.dumps([code, extraction.kind, self.extractor.fingerprint])
         name = hashlib.sha256(identity.encode()).hexdigest()[:24]
         self.store = DescriptorStore(cache / f"{extraction.kind}-{name}", memory_mb)
 
