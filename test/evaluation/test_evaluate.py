@@ -22,6 +22,7 @@ from pnv_core.evaluation.local_features import ratio_matches
 from pnv_core.evaluation.methods import GROUPS, parse_method, parse_methods
 from pnv_core.evaluation.multiscale import cross_size_score, early_fusion_score
 from pnv_core.evaluation.ranking import rerank, retrieve
+from pnv_core.evaluation.store import default_cache
 from pnv_core.model_files import Model
 from pnv_core.netvlad import Projection
 from pnv_core.types import PatchGrid, PlaceDescriptor
@@ -279,3 +280,11 @@ def test_unusable_input_is_one_line(
     captured = capsys.readouterr()
     assert complaint in captured.err
     assert captured.err.count("\n") == 1
+
+
+def test_an_unwritable_home_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pnv_core.evaluation.store.cache_folder", lambda: Path("/proc/nowhere"))
+    folder = default_cache()
+    assert folder.is_dir()
+    assert folder.name.startswith("pnv_descriptors_")
+    folder.rmdir()
