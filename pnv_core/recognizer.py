@@ -81,14 +81,15 @@ class PlaceRecognizer:
     def new_session(self) -> None:
         """What comes next is another run: its stamps may lie before those already seen."""
         self.database.new_session()
-        self._forget_the_past()
+        self.forget_the_past()
 
     def reset(self) -> None:
         """Forget every keyframe."""
         self.database.clear()
-        self._forget_the_past()
+        self.forget_the_past()
 
-    def _forget_the_past(self) -> None:
+    def forget_the_past(self) -> None:
+        """What went before says nothing about what comes: no predecessor, no sequence, no odometry."""
         self.keyframes.forget()
         self.sequence.forget()
         self.odometry.forget()

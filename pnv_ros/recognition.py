@@ -61,7 +61,7 @@ class Recognition:
 
     def map_was_replaced(self) -> None:
         """A map was loaded, which began a session. To be called while still."""
-        self.recognizer.keyframes.forget()
+        self.recognizer.forget_the_past()
         self.outputs.new_session()
         self.outputs.markers.forget()
 

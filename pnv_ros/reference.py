@@ -24,6 +24,7 @@ REASONS = {
     Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency)",
     Reason.ODOMETRY: "the jump is impossible by odometry",
     Reason.NOT_RERANKED: "left out to keep within time_budget_ms",
+    Reason.NOT_VERIFIED: "not among the best that local features examined (verify)",
 }
 DROPS = {
     Drop.BUSY: "a newer frame of the camera came before the worker was free",
