@@ -48,6 +48,11 @@ class Config:
     # Describing
     weights: str = setting("default", "model: 'default' (in the package), a published name, or a file")
     device: str = setting("cpu", "where the network runs", choices=("cpu", "cuda", "auto"))
+    trunk_precision: str = setting(
+        "float32",
+        "arithmetic of the network; bfloat16 is faster where the processor has it",
+        choices=("float32", "bfloat16"),
+    )
     threads: int = setting(2, "threads of the network and of matching; 0 = all cores", low=0, high=256)
     image_width: int = setting(
         0, "width the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192
@@ -65,7 +70,7 @@ class Config:
         (), "fusion weight per patch size, sum 1; empty = the model's", kind=float, low=0.0, high=1.0
     )
     patch_mode: str = setting(
-        "exact", "patch aggregation: exact, or fast (approximate, judged by recall)", choices=("exact", "fast")
+        "exact", "patch aggregation: exact, or fast (products in bfloat16 where it is fast)", choices=("exact", "fast")
     )
 
     # Keyframes

@@ -1,5 +1,6 @@
 """Describer: an image to a PlaceDescriptor. D dimensions, P patch sizes."""
 
+import copy
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from pnv_core.errors import ConfigError, ImageError
 from pnv_core.model_files import Model, load_model
 from pnv_core.parallel import workers
 from pnv_core.patches import PatchAggregator, patch_descriptors
-from pnv_core.trunks import CELL
+from pnv_core.trunks import CELL, Trunk
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.weights import resolve_weights
 
@@ -55,7 +56,7 @@ class Describer:
         for module in (model.trunk, model.netvlad, model.global_projection, model.patch_projection):
             if module is not None:
                 module.to(self.device)
-        model.trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self.trunk = _running(model.trunk, self.config.trunk_precision)
         if self.config.threads:
             torch.set_num_threads(self.config.threads)
         self.aggregator = self._aggregator()
@@ -67,7 +68,8 @@ class Describer:
             return None
         projection = self.model.patches_projection
         pool = workers(self.config.threads)
-        return PatchAggregator(self.model.netvlad.centroids, projection.weight, projection.bias, pool)
+        fast = self.config.patch_mode == "fast"
+        return PatchAggregator(self.model.netvlad.centroids, projection.weight, projection.bias, pool, fast)
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -111,7 +113,18 @@ class Describer:
     def features(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
         """(H, W, 3) uint8 of the configured size -> feature map (1, C, h, w)."""
         images = torch.from_numpy(pixels).to(self.device).permute(2, 0, 1)[None].float() / 255.0
-        return self.model.trunk(images.contiguous(memory_format=torch.channels_last)).float()
+        return self.trunk(images.contiguous(memory_format=torch.channels_last)).float()
+
+
+def _running(trunk: Trunk, precision: str) -> Trunk:
+    """The trunk as it runs: channels last, in the precision asked for, the normalisation of its input in float32."""
+    trunk = copy.deepcopy(trunk).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    normalisation = getattr(trunk, "input", None)
+    if precision == "bfloat16" and normalisation is not None:
+        trunk.bfloat16()
+        normalisation.float()
+        normalisation.register_forward_hook(lambda module, inputs, output: output.bfloat16())
+    return trunk
 
 
 def checked_image(rgb: Any) -> NDArray[np.uint8]:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
@@ -121,20 +122,29 @@ def _check_sizes(sizes: Sequence[int], shape: tuple[int, int]) -> None:
             raise ValueError(f"patch size {size} exceeds the feature map of {h} x {w} cells; allowed: 1 to {min(h, w)}")
 
 
+def bfloat16_is_fast() -> bool:
+    """Whether the processor multiplies bfloat16; elsewhere torch converts, which gains nothing."""
+    return hasattr(torch.cpu, "_is_avx512_bf16_supported") and bool(torch.cpu._is_avx512_bf16_supported())
+
+
 class PatchAggregator:
     """Patch descriptors with one vocabulary (K, C) and projection (D, K * C), (D,), on the processor.
 
     Each worker takes columns of the projection: one matrix product per cluster, then that cluster's window sums while
     the product is still in cache. The norms come from products of neighbouring local descriptors (`kernels`).
+    `fast` projects in bfloat16 where the processor multiplies it; all else stays float32.
     """
 
-    def __init__(self, centroids: Tensor, projection: Tensor, bias: Tensor, workers: Workers) -> None:
+    def __init__(
+        self, centroids: Tensor, projection: Tensor, bias: Tensor, workers: Workers, fast: bool = False
+    ) -> None:
         k, c = centroids.shape
         self.workers = workers
+        self.fast = fast and bfloat16_is_fast()
         self.centroids = centroids.detach().numpy()
-        per_cluster = projection.detach().view(-1, k, c).permute(1, 0, 2)
-        self.projection = np.ascontiguousarray(per_cluster.numpy())  # (K, D, C)
-        self.offsets = np.einsum("kdc,kc->kd", self.projection, self.centroids)  # (K, D), the projected centroids
+        self.projection = projection.detach().view(-1, k, c).permute(1, 0, 2).contiguous()  # (K, D, C)
+        if self.fast:
+            self.projection = self.projection.bfloat16()
         self.bias = bias.detach().numpy()
 
     def __call__(
@@ -144,13 +154,16 @@ class PatchAggregator:
         _check_sizes(sizes, shape)
         order = np.argsort(sizes, kind="stable")
         grid = _Grid(shape, [sizes[i] for i in order], [strides[i] for i in order])
-        local = np.ascontiguousarray(x.T.numpy())
+        local = np.array(x.T.numpy(), order="C")
         assignment = np.ascontiguousarray(weights.numpy())
-        scales, touched = self._scales(local, assignment, grid)
+        middle = local.mean(0)  # residuals do not change, but smaller numbers cancel less
+        local -= middle
+        centroids = self.centroids - middle
+        scales, touched = self._scales(local, assignment, centroids, grid)
         out = np.empty((grid.starts[-1], len(self.bias)), np.float32)
         columns = max(_LANES // 2, min(_COLUMNS, -(-len(self.bias) // self.workers.threads)))
         parts = [(a, min(a + columns, len(self.bias))) for a in range(0, len(self.bias), columns)]
-        self.workers.map(partial(self._add_clusters, local, assignment, scales, grid, out), parts)
+        self.workers.map(partial(self._add_clusters, local, assignment, centroids, scales, grid, out), parts)
         rows = spans(len(out), self.workers.threads)
         self.workers.map(lambda span: _finish(out[slice(*span)], self.bias, touched[slice(*span)]), rows)
         found: list[NDArray[np.float32]] = [out] * len(sizes)
@@ -159,21 +172,19 @@ class PatchAggregator:
         return found
 
     def _scales(
-        self, x: NDArray[np.float32], weights: NDArray[np.float32], grid: "_Grid"
+        self, x: NDArray[np.float32], weights: NDArray[np.float32], centroids: NDArray[np.float32], grid: "_Grid"
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """(K, P) factors normalising each cluster's sum in each patch, (P,) whether any cluster touches it."""
         h, w = grid.shape
-        middle = x.mean(0)
-        shifted, centroids = x - middle, self.centroids - middle
         gram = np.empty((h * w, h * w), np.float32)
         reach = grid.sizes[-1]
 
         def products(rows: tuple[int, int]) -> None:
             first, end = rows[0] * w, min(rows[1] + reach - 1, h) * w
-            np.matmul(shifted[first : rows[1] * w], shifted[first:end].T, out=gram[first : rows[1] * w, first:end])
+            np.matmul(x[first : rows[1] * w], x[first:end].T, out=gram[first : rows[1] * w, first:end])
 
         self.workers.map(products, [(a, min(a + reach, h)) for a in range(0, h, reach)])
-        arguments = (shifted, gram, shifted @ centroids.T, np.ascontiguousarray(weights.T), centroids)
+        arguments = (x, gram, x @ centroids.T, np.ascontiguousarray(weights.T), centroids)
         squares = np.square(centroids).sum(1)
         scales = np.empty((grid.starts[-1], len(centroids)), np.float32)
         for place, (size, stride) in enumerate(zip(grid.sizes, grid.strides, strict=True)):
@@ -196,6 +207,7 @@ class PatchAggregator:
         self,
         x: NDArray[np.float32],
         weights: NDArray[np.float32],
+        centroids: NDArray[np.float32],
         scales: NDArray[np.float32],
         grid: "_Grid",
         out: NDArray[np.float32],
@@ -206,10 +218,16 @@ class PatchAggregator:
         maps = np.empty((len(x), end - first), np.float32)
         lanes = spans(end - first, -(-(end - first) // _LANES), align=16)
         sums = [np.zeros((len(out), b - a), np.float32) for a, b in lanes]
+        rounded = torch.from_numpy(x).bfloat16() if self.fast else None
         for k in range(len(weights)):
-            np.matmul(x, self.projection[k, first:end].T, out=maps)
+            columns = self.projection[k, first:end]
+            if rounded is None:
+                np.matmul(x, columns.numpy().T, out=maps)
+            else:
+                maps = torch.mm(rounded, columns.T).float().numpy()
+            projected = columns.float().numpy() @ centroids[k]
             for (a, b), total in zip(lanes, sums, strict=True):
-                offsets = self.offsets[k, first + a : first + b]
+                offsets = projected[a:b]
                 windows = (*grid.shape, grid.sizes, grid.strides, grid.starts)
                 kernels.add_windows(maps[:, a:b], offsets, weights[k], scales[k], *windows, total)
         for (a, b), total in zip(lanes, sums, strict=True):
