@@ -31,6 +31,7 @@ _SCORING = tuple(
         "evaluation.local_features",
     )
 )  # fmt: skip
+_STORES = 8  # kinds of features that may be held at once share the memory budget
 MATRIX_SIDE = 160  # rows and columns kept of the similarity matrix
 
 
@@ -100,19 +101,20 @@ class Evaluation:
         self.depth = max(depth, config.candidates)
         self._ready: dict[Extraction, Describing] = {}
         self._completed: dict[Config, Config] = {}
+        self._sizes: dict[Config, set[int]] = {}  # patch sizes described together, for methods that share features
 
     def run(self, dataset: Dataset, methods: Sequence[Method]) -> list[MethodResult]:
         """Every method over the data set, in order. Raises PnvError for an unusable image, model or method."""
-        sizes = self._all_sizes(methods)
-        return [self.run_one(dataset, method, sizes) for method in methods]
+        for method in methods:
+            config = method.config(self.config)
+            if "densevlad" not in (method.features, method.retrieval):
+                done = self.completed(config)
+                self._sizes.setdefault(config, set()).update(done.patch_sizes, method.wanted_sizes(done))
+        return [self._run_one(dataset, method) for method in methods]
 
-    def run_one(
-        self, dataset: Dataset, method: Method, sizes: dict[Config, tuple[int, ...]] | None = None
-    ) -> MethodResult:
-        """One method; `sizes` are the patch sizes extracted together per Config, for methods that share features."""
-        sizes = sizes or self._all_sizes([method])
-        retrieval = self.describing(dataset, method, method.retrieval, sizes)
-        features = self.describing(dataset, method, method.features, sizes)
+    def _run_one(self, dataset: Dataset, method: Method) -> MethodResult:
+        retrieval = self.describing(dataset, method, method.retrieval)
+        features = self.describing(dataset, method, method.features)
         used = [retrieval] if features is retrieval else [retrieval, features]
         keys = {
             id(d): (self._described(d, dataset, "references"), self._described(d, dataset, "queries")) for d in used
@@ -137,9 +139,7 @@ class Evaluation:
             self._reference_bytes(method, features, keys[id(features)][0], dataset.references, references),
         )
 
-    def describing(
-        self, dataset: Dataset, method: Method, kind: str, sizes: dict[Config, tuple[int, ...]] | None = None
-    ) -> Describing:
+    def describing(self, dataset: Dataset, method: Method, kind: str) -> Describing:
         """The ready extraction of a kind of features for a method."""
         config = method.config(self.config)
         if kind == "densevlad":
@@ -148,14 +148,14 @@ class Evaluation:
                 config = self.config.replace(weights=str(path), patch_sizes=(), patch_strides=(), patch_weights=())
         else:
             done = self.completed(config)
-            wanted = (sizes or self._all_sizes([method])).get(config, done.patch_sizes)
-            if wanted != done.patch_sizes:
+            wanted = tuple(sorted(self._sizes.get(config, done.patch_sizes)))
+            if wanted != tuple(sorted(done.patch_sizes)):
                 strides = dict(zip(done.patch_sizes, done.patch_strides, strict=True))
                 own = tuple(strides.get(size, 1) for size in wanted)
                 config = config.replace(patch_sizes=wanted, patch_strides=own, patch_weights=())
         extraction = Extraction(kind, config)
         if extraction not in self._ready:
-            self._ready[extraction] = Describing(extraction, self.cache, self.config.memory_budget_mb / 4)
+            self._ready[extraction] = Describing(extraction, self.cache, self.config.memory_budget_mb / _STORES)
         return self._ready[extraction]
 
     def completed(self, config: Config) -> Config:
@@ -178,16 +178,6 @@ class Evaluation:
         paths = dataset.references if part == "references" else dataset.queries
         what = f"{dataset.name}, {describing.extraction.kind}, {part}"
         return describing.describe_all(paths, self.progress, self.workers, self.dask, what)
-
-    def _all_sizes(self, methods: Sequence[Method]) -> dict[Config, tuple[int, ...]]:
-        """Per Config every patch size that some method scores."""
-        found: dict[Config, set[int]] = {}
-        for method in methods:
-            config = method.config(self.config)
-            if "densevlad" not in (method.features, method.retrieval):
-                done = self.completed(config)
-                found.setdefault(config, set()).update(done.patch_sizes, method.wanted_sizes(done))
-        return {config: tuple(sorted(sizes)) for config, sizes in found.items()}
 
     def _shared_projection(self, describing: Describing) -> bool:
         describer = getattr(describing.extractor, "describer", None)
