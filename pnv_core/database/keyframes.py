@@ -386,6 +386,17 @@ class KeyframeDatabase:
             keyframes = [self._keyframes[i] for i in self._ids]
             return Snapshot(self._lineage, self.dim, self._next_id, self._session + 1, keyframes)
 
+    def require_room(self, keyframes: int, patch_bytes: int) -> None:
+        """Raises PnvError unless an empty database could take so many keyframes with so many bytes of patches."""
+        budget = self.bytes_budget - keyframes * (self._table.row_bytes + OBJECT_BYTES)
+        on_disk = self._patch_file.limit if self._patch_file is not None else 0
+        if budget < 0 or budget + on_disk < patch_bytes:
+            need = (self.bytes_budget - budget + patch_bytes) / MB
+            raise PnvError(
+                f"the map takes {need:.3g} MB; memory_budget_mb = {self.bytes_budget / MB:g} given; "
+                "allowed: a larger budget, patch_store = disk, or a pruned map"
+            )
+
     def restore(self, keyframes: Iterable[KeyframeRecord], next_id: int, next_session: int) -> object:
         """Replace the contents by keyframes of a saved map, by ascending id, and begin a new session.
 
@@ -407,8 +418,8 @@ class KeyframeDatabase:
         while self._bytes_with(1) + len(buffer) > self.bytes_budget:
             if not self._spill():
                 raise PnvError(
-                    f"the map takes more than memory_budget_mb = {self.bytes_budget / MB:g} "
-                    f"({len(self._ids)} keyframes fit); allowed: a larger budget, patch_store = disk, or a pruned map"
+                    f"{len(self._ids)} keyframes of the map fill memory_budget_mb = {self.bytes_budget / MB:g}; "
+                    "allowed: a larger budget, or a pruned map"
                 )
         self._insert(kf.ref, kf.vector, self._shared(kf.layouts), buffer, kf.texture)
 

@@ -46,7 +46,7 @@ class PatchFile:
             raise ConfigError(
                 f"patch_folder = {str(self.folder)!r}: {error.strerror}; allowed: a writable folder"
             ) from error
-        self._limit = limit
+        self.limit = limit
         self.end = 0
         self._free: defaultdict[int, deque[int]] = defaultdict(deque)  # by room
 
@@ -55,7 +55,7 @@ class PatchFile:
         room = _room(len(buffer))
         free = self._free[room]
         place = free.popleft() if free else self.end
-        if place == self.end and self.end + room > self._limit:
+        if place == self.end and self.end + room > self.limit:
             return None
         try:
             self._write_at(place, buffer.data)

@@ -71,7 +71,8 @@ class MapStore:
     def load(self, database: KeyframeDatabase) -> Manifest:
         """Verify the whole map, then replace the database's contents by it and begin a new session.
 
-        Raises MapError for a map that is damaged or of another model, PnvError for one beyond the memory budget.
+        Raises MapError for a map that is damaged or of another model, PnvError for one beyond the memory budget; the
+        database is then as it was.
         """
         manifest = read_manifest(self.path)
         if manifest.fingerprint != self.fingerprint:
@@ -81,8 +82,7 @@ class MapStore:
             )
         if manifest.dim != database.dim:
             raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")
-        for _ in keyframes_of(self.path, manifest):
-            pass
+        database.require_room(manifest.keyframes, sum(len(kf.buffer) for kf in keyframes_of(self.path, manifest)))
         keyframes = keyframes_of(self.path, manifest)
         self._lineage = database.restore(keyframes, manifest.next_id, manifest.next_session)
         self._known = manifest
