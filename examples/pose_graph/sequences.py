@@ -59,7 +59,7 @@ def icl_office(folder: Path) -> Walk:
     stamps, truth = _poses(folder / "poses.csv", pose)
     drift = Drift(deg_per_m=0.0, turn=0.08)
     parameters = {"exclude_recent_s": 15.0, "min_interval_s": 0.3}
-    noise = Noise(tolerance_m=0.3, tolerance_deg=10.0)
+    noise = Noise(odometry_deg_per_deg=0.08, tolerance_m=0.15, tolerance_deg=10.0)
     return Walk("icl_office_kt3", _flags(folder), stamps, truth, 0.7, drift, noise, parameters, _ICL_CAMERA)
 
 
@@ -86,9 +86,9 @@ def _poses(path: Path, pose: Callable[..., Pose]) -> tuple[list[int], Array]:
 def walks(shared: Path) -> list[Walk]:
     """Three rendered places, and the recorded walks whose data is there."""
     rendered = [
-        world("corridor", 1, 1.4, 1.0, 1.0),
-        world("hall", 2, 1.4, 1.0, 1.0),
-        world("street", 2, 1.25, 2.0, 1.5),
+        world("corridor", 1, 1.4, 1.0, 0.5),
+        world("hall", 2, 1.4, 1.0, 0.5),
+        world("street", 2, 1.25, 2.0, 1.0),
     ]
     recorded = [
         build(shared / name)
