@@ -69,14 +69,13 @@ def mutual_matches(query: Tensor, reference: Tensor) -> tuple[NDArray[np.int64],
     return forward[matched], matched
 
 
-def rapid_score(query_grid: NDArray[np.int64], reference_grid: NDArray[np.int64], patches: int) -> float:
+def rapid_score(query_grid: NDArray[np.int64], reference_grid: NDArray[np.int64], rows: int, cols: int) -> float:
     """(M, 2) grid coordinates (column, row) of the matches -> the authors' score, lower is better."""
     if not len(query_grid):
         return 0.0
     shift = reference_grid - query_grid
-    extent = query_grid.max(0, initial=0)
     residual = np.abs(shift - shift.mean(0))
-    return -float(((extent - residual) ** 2).sum()) / patches
+    return -float(((np.array([cols - 1, rows - 1]) - residual) ** 2).sum()) / (rows * cols)
 
 
 def ransac_score(query_xy: NDArray[np.int64], reference_xy: NDArray[np.int64], patches: int) -> float:

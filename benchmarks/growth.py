@@ -1,0 +1,115 @@
+"""How the product's times grow: patches with image size, patch sizes, K and D; retrieval with keyframes; re-ranking."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+
+from pnv_core.config import Config
+from pnv_core.database import KeyframeDatabase
+from pnv_core.parallel import workers
+from pnv_core.patches import PatchAggregator
+from pnv_core.reranker import Reranker
+from pnv_core.types import PatchGrid, PlaceDescriptor
+
+_ROUNDS = 3
+_CHANNELS = 512
+
+
+def _ms(function: Callable[[], Any]) -> float:
+    function()
+    taken = []
+    for _ in range(_ROUNDS):
+        start = time.perf_counter()
+        function()
+        taken.append((time.perf_counter() - start) * 1e3)
+    return round(float(np.median(taken)), 3)
+
+
+def _patches_ms(cells: tuple[int, int], sizes: tuple[int, ...], clusters: int, dim: int, threads: int) -> float:
+    rng = np.random.default_rng(0)
+    centroids = F.normalize(torch.from_numpy(rng.standard_normal((clusters, _CHANNELS), np.float32))) * 0.3
+    projection = torch.from_numpy(rng.standard_normal((dim, clusters * _CHANNELS), np.float32))
+    aggregator = PatchAggregator(centroids, projection, torch.zeros(dim), workers(threads))
+    x = F.normalize(torch.from_numpy(rng.standard_normal((_CHANNELS, cells[0] * cells[1]), np.float32)), dim=0)
+    weights = torch.softmax(20 * centroids @ x, dim=0)
+    return _ms(lambda: aggregator(x, weights, cells, sizes, (1,) * len(sizes)))
+
+
+def _retrieval_ms(keyframes: int, dim: int = 512) -> float:
+    rng = np.random.default_rng(0)
+    vectors = rng.standard_normal((keyframes, dim), np.float32)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    database = KeyframeDatabase(dim, memory_budget_mb=4096.0)
+    for number, vector in enumerate(vectors):
+        database.add(number, "camera", PlaceDescriptor(vector, ()))
+    return _ms(lambda: database.nearest(vectors[0], 10, 10**9, 0))
+
+
+def _reranking_ms(candidates: int, threads: int, dim: int = 64, side: tuple[int, int] = (15, 20)) -> float:
+    rng = np.random.default_rng(0)
+
+    def place() -> PlaceDescriptor:
+        grids = []
+        for size in (2, 3, 5):
+            shape = side[0] - size + 1, side[1] - size + 1
+            rows = rng.standard_normal((shape[0] * shape[1], dim)).astype(np.float32)
+            rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+            grids.append(PatchGrid(size, *shape, rows))
+        return PlaceDescriptor(np.zeros(dim, np.float32), tuple(grids))
+
+    settings = Config.make(patch_sizes=(2, 3, 5), patch_weights=(0.34, 0.33, 0.33), threads=threads)
+    reranker, query, references = Reranker(settings), place(), [place() for _ in range(candidates)]
+    return _ms(lambda: reranker.scores(query, references))
+
+
+def measured_growth(threads: int) -> dict[str, dict[str, list[float]]]:
+    """Per quantity its values and the milliseconds of each."""
+
+    def series(values: list[Any], measure: Callable[[Any], float], shown: Callable[[Any], Any] = lambda v: v) -> dict:
+        return {"values": [shown(v) for v in values], "ms": [measure(v) for v in values]}
+
+    three = (2, 5, 8)
+    found = {
+        "image width [px], 4:3": series(
+            [320, 480, 640, 960],
+            lambda w: _patches_ms((w * 3 // 4 // 16, w // 16), three, 16, 512, threads),
+        ),
+        "number of patch sizes": series(
+            [(5,), (2, 5), three, (2, 3, 5, 8), (2, 3, 4, 5, 6, 8)],
+            lambda sizes: _patches_ms((30, 40), sizes, 16, 512, threads),
+            len,
+        ),
+        "clusters K": series([8, 16, 32, 64], lambda k: _patches_ms((30, 40), three, k, 512, threads)),
+        "dimensions D": series([64, 128, 512, 1024, 2048], lambda d: _patches_ms((30, 40), three, 16, d, threads)),
+        "keyframes (retrieval)": series([100, 1000, 10000, 50000], _retrieval_ms),
+        "candidates (default model's patches, RANSAC)": series(
+            [1, 3, 10, 30, 100], lambda n: _reranking_ms(n, threads)
+        ),
+    }
+    for name, line in found.items():
+        print(f"{name}: " + ", ".join(f"{v}: {ms:.2f} ms" for v, ms in zip(line["values"], line["ms"], strict=True)))
+    return found
+
+
+def plotted(growth: dict[str, dict[str, list[float]]], path: Path) -> None:
+    """One small plot per quantity, in one picture."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(2, 3, figsize=(12, 6.5))
+    for axis, (name, line) in zip(axes.ravel(), growth.items(), strict=True):
+        axis.plot(line["values"], line["ms"], "o-")
+        axis.set_xlabel(name)
+        axis.set_ylabel("ms")
+        axis.set_xlim(left=0)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)

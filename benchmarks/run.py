@@ -1,0 +1,276 @@
+"""The benchmarks: product against a plain implementation of the authors' formulation, alternating in one process.
+
+python -m benchmarks.run [--rounds N] [--threads N] [--out DIR]    prints a table, writes DIR/benchmarks.json and plots
+
+Every row is the median over rounds in which both sides took turns, so that a busy machine burdens both; the processor
+time of both is given beside the wall time. A row of the machine says what a large product and a large copy reach.
+"""
+
+import argparse
+import json
+import platform
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import pnv_core.openmp  # noqa: F401 - before torch is loaded  # isort: skip
+import torch
+import torch.nn.functional as F
+
+from benchmarks import baseline
+from benchmarks.growth import measured_growth, plotted
+from pnv_core.compact import CompactTrunk
+from pnv_core.config import Config
+from pnv_core.files import atomic_write
+from pnv_core.parallel import workers
+from pnv_core.patches import PatchAggregator, bfloat16_is_fast
+from pnv_core.reranker import Reranker
+from pnv_core.trunks import VGG16Trunk
+from pnv_core.types import PatchGrid, PlaceDescriptor
+
+SIZES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
+CELLS = (30, 40)  # of 640x480
+CHANNELS = 512
+
+
+def timed(function: Callable[[], Any]) -> tuple[float, float]:
+    """Wall and processor milliseconds of one call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    function()
+    return (time.perf_counter() - wall) * 1e3, (time.process_time() - cpu) * 1e3
+
+
+def compared(name: str, sides: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Any]:
+    """One row: the median milliseconds of each side over rounds in which they take turns, and ratios to the first."""
+    for side, function in sides.items():
+        if side != "baseline":
+            function()  # compiles and allocates
+    taken: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
+    for _ in range(rounds):
+        for side, function in sides.items():
+            taken[side].append(timed(function))
+    first = next(iter(sides))
+    medians = {side: np.median(times, axis=0) for side, times in taken.items()}
+    ratios = {
+        side: np.median([np.divide(a, b) for a, b in zip(taken[first], times, strict=True)], axis=0)
+        for side, times in taken.items()
+    }
+    row = {"name": name, "rounds": rounds, "sides": {}}
+    for side in sides:
+        row["sides"][side] = {
+            "ms": round(float(medians[side][0]), 2),
+            "cpu_ms": round(float(medians[side][1]), 2),
+            "ratio": round(float(ratios[side][0]), 2),
+            "cpu_ratio": round(float(ratios[side][1]), 2),
+        }
+    print(row_text(row), flush=True)
+    return row
+
+
+def row_text(row: dict[str, Any]) -> str:
+    parts = [
+        f"{s} {v['ms']:.1f} ms ({v['ratio']:.1f}x; processor {v['cpu_ms']:.1f} ms, {v['cpu_ratio']:.1f}x)"
+        for s, v in row["sides"].items()
+    ]
+    return f"{row['name']}: " + ", ".join(parts)
+
+
+def smooth_features(rng: np.random.Generator, cells: tuple[int, int], channels: int) -> torch.Tensor:
+    """(1, C, h, w): features whose neighbours resemble one another, as those of a network do."""
+    coarse = torch.from_numpy(rng.standard_normal((1, channels, 5, 6), np.float32))
+    fine = torch.from_numpy(rng.standard_normal((1, channels, *cells), np.float32))
+    return F.interpolate(coarse, cells, mode="bicubic") + 0.5 * fine
+
+
+def vocabulary(rng: np.random.Generator, clusters: int, dim: int) -> tuple[torch.Tensor, ...]:
+    """Random centroids (K, C), assignment (K, C), projection (D, K * C), bias (D,)."""
+    centroids = F.normalize(torch.from_numpy(rng.standard_normal((clusters, CHANNELS), np.float32))) * 0.3
+    projection = torch.from_numpy(rng.standard_normal((dim, clusters * CHANNELS), np.float32)) / 8
+    return (
+        centroids,
+        F.normalize(centroids) * 40,
+        projection,
+        torch.from_numpy(rng.standard_normal(dim, np.float32)) / 50,
+    )
+
+
+def patches_row(clusters: int, dim: int, threads: int, rounds: int) -> dict[str, Any]:
+    rng = np.random.default_rng(0)
+    features = smooth_features(rng, CELLS, CHANNELS)
+    centroids, assignment, projection, bias = vocabulary(rng, clusters, dim)
+    pool = workers(threads)
+    aggregators = {
+        mode: PatchAggregator(centroids, projection, bias, pool, mode == "fast") for mode in ("exact", "fast")
+    }
+
+    def product(mode: str) -> list[np.ndarray]:
+        x = F.normalize(features[0].flatten(1), dim=0)
+        weights = torch.softmax(assignment @ x, dim=0)
+        return aggregators[mode](x, weights, CELLS, SIZES, (1, 1, 1))
+
+    def plain() -> list[torch.Tensor]:
+        return baseline.patch_descriptors(features, assignment, centroids, projection, bias, SIZES)
+
+    row = compared(
+        f"patches 2, 5, 8 at 640x480, K={clusters}, D={dim}",
+        {"baseline": plain, "exact": lambda: product("exact"), "fast": lambda: product("fast")},
+        rounds,
+    )
+    flops = 2 * clusters * dim * CHANNELS * CELLS[0] * CELLS[1]
+    row["exact_gflops"] = round(flops / row["sides"]["exact"]["ms"] / 1e6, 1)
+    pairs = list(zip(product("exact"), product("fast"), strict=True))
+    row["fast_worst_1_minus_cosine"] = float(max((1 - (e * f).sum(1)).max() for e, f in pairs))
+    return row
+
+
+def places(rng: np.random.Generator, count: int, dim: int) -> list[PlaceDescriptor]:
+    """Patch grids of 640x480: the first two show one place with noise, the others places of their own."""
+    found = []
+    shared = rng.standard_normal((*CELLS, dim)).astype(np.float32)
+    for number in range(count):
+        own = shared if number < 2 else rng.standard_normal((*CELLS, dim)).astype(np.float32)
+        cells = torch.from_numpy(own + 0.7 * rng.standard_normal(own.shape).astype(np.float32)).permute(2, 0, 1)
+        grids = []
+        for size in SIZES:
+            rows = F.normalize(F.avg_pool2d(cells, size, 1).flatten(1).T, dim=1).numpy().astype(np.float16)
+            grids.append(PatchGrid(size, CELLS[0] - size + 1, CELLS[1] - size + 1, rows))
+        found.append(PlaceDescriptor(np.zeros(dim, np.float32), tuple(grids)))
+    return found
+
+
+def plain_reranking(query: PlaceDescriptor, references: list[PlaceDescriptor], scorer: str) -> list[float]:
+    """One candidate and one patch size at a time; larger is better."""
+    scores = []
+    for reference in references:
+        total = 0.0
+        for q, r, weight in zip(query.patches, reference.patches, WEIGHTS, strict=True):
+            ours, theirs = (torch.from_numpy(g.descriptors.astype(np.float32).T.copy()) for g in (q, r))
+            matched_q, matched_r = baseline.mutual_matches(ours, theirs)
+            if scorer == "rapid":
+                total -= weight * baseline.rapid_score(q.indices()[matched_q], r.indices()[matched_r], q.rows, q.cols)
+            else:
+                total -= weight * baseline.ransac_score(
+                    q.keypoints()[matched_q], r.keypoints()[matched_r], q.rows * q.cols
+                )
+        scores.append(total)
+    return scores
+
+
+def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: int) -> dict[str, Any]:
+    query, *references = places(np.random.default_rng(1), candidates + 1, dim)
+    sides: dict[str, Callable[[], Any]] = {"baseline": lambda: plain_reranking(query, references, scorer)}
+    for mode in ("exact", "bounded", "coarse") if scorer == "ransac" else ("exact", "coarse"):
+        settings = Config.make(
+            patch_sizes=SIZES,
+            patch_strides=(1, 1, 1),
+            patch_weights=WEIGHTS,
+            scorer=scorer,
+            match_mode=mode,
+            threads=threads,
+        )
+        sides[mode] = partial(Reranker(settings).scores, query, references)
+    return compared(f"re-ranking {candidates} candidates, sizes 2, 5, 8, {scorer}, D={dim}", sides, rounds)
+
+
+def trunk_row(name: str, trunk: torch.nn.Module, size: tuple[int, int], rounds: int) -> dict[str, Any]:
+    torch.manual_seed(0)
+    for parameter in trunk.parameters():
+        if parameter.ndim == 4:
+            torch.nn.init.kaiming_normal_(parameter)
+    trunk.eval().requires_grad_(False)
+    image = torch.rand(1, 3, *size)
+    packed = image.contiguous(memory_format=torch.channels_last)
+    channels_last = deepcopy(trunk).to(memory_format=torch.channels_last)
+    sides: dict[str, Callable[[], Any]] = {
+        "baseline": lambda: trunk(image),
+        "channels last": lambda: channels_last(packed),
+    }
+    if bfloat16_is_fast():
+        half, half_image = deepcopy(channels_last).bfloat16(), packed.bfloat16()
+        sides["bfloat16"] = lambda: half(half_image)
+    return compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
+
+
+def roofline(threads: int) -> dict[str, Any]:
+    """What this machine reaches in this run: GFLOP/s of large products, GB/s of a large copy (read and written)."""
+    n = 2048
+    a = torch.randn(n, n)
+    half, byte = a.bfloat16(), torch.randint(-100, 100, (n, n), dtype=torch.int8)
+    source = np.ones(1 << 26, np.float32)
+    target = np.empty_like(source)
+    parts = [(i * len(source) // threads, (i + 1) * len(source) // threads) for i in range(threads)]
+
+    def copy() -> None:
+        workers(threads).map(lambda p: np.copyto(target[p[0] : p[1]], source[p[0] : p[1]]), parts)
+
+    def best(function: Callable[[], Any]) -> float:
+        return min(timed(function)[0] for _ in range(5)) / 1e3
+
+    found = {
+        "float32_gflops": 2 * n**3 / best(lambda: a @ a) / 1e9,
+        "bfloat16_gflops": 2 * n**3 / best(lambda: half @ half) / 1e9,
+        "int8_gops": 2 * n**3 / best(lambda: torch._int_mm(byte, byte)) / 1e9,
+        "copy_gbytes": 2 * source.nbytes / best(copy) / 1e9,
+    }
+    print("machine: " + ", ".join(f"{name} {value:.0f}" for name, value in found.items()), flush=True)
+    return {name: round(value, 1) for name, value in found.items()}
+
+
+def machine() -> dict[str, Any]:
+    text = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    model = next(
+        (line.split(":", 1)[1].strip() for line in text.splitlines() if line.startswith("model name")),
+        platform.processor(),
+    )
+    return {"processor": model, "cores": torch.get_num_threads(), "torch": torch.__version__, "numpy": np.__version__}
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    lines = [
+        "| what | " + " | ".join(["side", "ms", "ratio", "processor ms", "processor ratio"]) + " |",
+        "|---|---|---:|---:|---:|---:|",
+    ]
+    for row in rows:
+        for side, v in row["sides"].items():
+            figures = (f"{v[key]:.1f}" for key in ("ms", "ratio", "cpu_ms", "cpu_ratio"))
+            lines.append("| " + " | ".join([row["name"], side, *figures]) + " |")
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmarks"))
+    parser.add_argument("--quick", action="store_true", help="one row of each kind, no growth")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    with torch.inference_mode():
+        peak = roofline(args.threads)
+        settings = [(16, 512)] if args.quick else [(16, 512), (64, 512), (16, 4096)]
+        rows = [patches_row(k, d, args.threads, args.rounds) for k, d in settings]
+        count = 10 if args.quick else 100
+        rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
+        rows.append(reranking_row(128, "ransac", count, args.threads, 1 if args.quick else args.rounds))
+        rows.append(trunk_row("compact trunk", CompactTrunk(), (240, 320), 5 * args.rounds))
+        if not args.quick:
+            rows.append(trunk_row("VGG16", VGG16Trunk(), (480, 640), args.rounds))
+        growth = {} if args.quick else measured_growth(args.threads)
+    report = {"machine": machine(), "roofline": peak, "rows": rows, "growth": growth}
+    args.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(args.out / "benchmarks.json") as file:
+        file.write((json.dumps(report, indent=1) + "\n").encode())
+    if growth:
+        plotted(growth, args.out / "growth.png")
+    print(table(rows))
+    print(f"written to {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
