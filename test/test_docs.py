@@ -6,12 +6,16 @@ import shlex
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pnv_cli.main import COMMANDS, main
 from pnv_core.config import Config
+from pnv_core.describer import load_describer
+from pnv_core.maps import MapStore
+from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.settings import settings_of
 from pnv_core.types import Frame
 from pnv_ros.node_config import NodeConfig
@@ -63,17 +67,38 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: str(p.relative_to(ROOT)))
 def test_the_code_of_a_page_runs(page: Path, folder: Path) -> None:
+    names = given_names() if any(language == "python" for language, _ in blocks(page)) else {}
     for language, text in blocks(page):
         if language == "console":
             for command in commands(text, "$ "):
                 run(command)
         elif language == "python":
-            frames = [(i * 10**9, np.asarray(place(i))) for i in range(3)]
-            exec(compile(text, str(page), "exec"), {"frames": frames, "Frame": Frame})
+            exec(compile(text, str(page), "exec"), names)
         elif language == "bash":
             for command in commands(text, ""):
                 if command.startswith("pnv "):
                     parsed(command)
+
+
+def given_names() -> dict[str, object]:
+    """What the documentation's Python takes for granted."""
+    frames = [(i * 40 * 10**9, np.asarray(place(i % 2))) for i in range(4)]
+    describer = load_describer()
+    recognizer = PlaceRecognizer(Config(), describer)
+    closures = [c for stamp, rgb in frames for c in recognizer.process(Frame(stamp, "/camera/image_raw", rgb))]
+    MapStore("office.map", describer.fingerprint).save(recognizer.database.snapshot())
+    camera = {"fx": 300.0, "fy": 300.0, "cx": 80.0, "cy": 60.0, "width": 160}
+    publisher = SimpleNamespace(publish=lambda message: None)
+    return {
+        **camera,
+        "frames": frames,
+        "describer": describer,
+        "recognizer": recognizer,
+        "closure": closures[-1],
+        "depth": None,
+        "publisher": publisher,
+        "send": lambda pairs: None,
+    }
 
 
 def run(command: str) -> None:
