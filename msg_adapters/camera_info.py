@@ -27,6 +27,7 @@ class Rectifier:
         model = info.distortion_model
         if d.size and model not in PINHOLE + FISHEYE:
             raise ImageError(f"distortion model {model!r} is unknown; allowed: {', '.join(PINHOLE + FISHEYE)}")
+        self.focal_and_centre = k[0, 0], k[1, 1], k[0, 2], k[1, 2]  # pixels, before and after
         self._maps: tuple[Any, Any] | None = None
         if d.any():
             undistort = cv2.fisheye.initUndistortRectifyMap if model in FISHEYE else cv2.initUndistortRectifyMap

@@ -8,11 +8,11 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import Point, PoseStamped
+from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy, qos_profile_sensor_data
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
@@ -76,18 +76,12 @@ class Markers:
         self._publisher = node.create_publisher(MarkerArray, "~/markers", MARKERS_QOS)
         self._closures: deque[tuple[int, int, float]] = deque(maxlen=_KEPT_CLOSURES)
         self._lock = Lock()  # the worker adds, the timer publishes
-        self._track = PoseTrack()
-        self._subscriptions = [
-            node.create_subscription(kind, topic, self._track.add, qos_profile_sensor_data)
-            for kind, topic in ((Odometry, config.odometry_topic), (PoseStamped, config.pose_topic))
-            if topic
-        ]
+        self.track = PoseTrack()
+        self._posed = bool(config.odometry_topic or config.pose_topic)
         self._drawn: tuple[int, int, int] | None = None
 
     def close(self) -> None:
         self._node.destroy_publisher(self._publisher)
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
 
     def add(self, closures: Sequence[LoopClosure]) -> None:
         """Remember accepted closures."""
@@ -102,15 +96,15 @@ class Markers:
         if not config.publish_markers or not self._publisher.get_subscription_count():
             self._drawn = None
             return
-        placed = self._track.place(refs) if self._subscriptions else timeline(refs)
+        placed = self.track.place(refs) if self._posed else timeline(refs)
         with self._lock:
             closures = list(self._closures)
         state = (refs[-1].id if refs else -1, closures[-1][0] if closures else -1, len(placed))
         if state == self._drawn:
             return
         self._drawn = state
-        frame_id = (self._subscriptions and self._track.frame_id) or config.frame_id
-        self._publisher.publish(map_markers(placed, closures, frame_id, arcs=not self._subscriptions))
+        frame_id = (self._posed and self.track.frame_id) or config.frame_id
+        self._publisher.publish(map_markers(placed, closures, frame_id, arcs=not self._posed))
 
 
 def timeline(refs: Sequence[ImageRef]) -> dict[int, tuple[float, float, float]]:

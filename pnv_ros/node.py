@@ -6,18 +6,23 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 
 from msg_adapters.camera_info import Rectifier
+from msg_adapters.images import stamp_of
 from pnv_core.database import KeyframeDatabase
 from pnv_core.describer import Describer, describer_from
-from pnv_core.errors import ConfigError, ImageError, MapError, PnvError
+from pnv_core.errors import ConfigError, MapError, PnvError
 from pnv_core.maps import Autosave, SaveReport
 from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.relative_poses import RelativePoses
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
 from pnv_ros.diagnostics import Diagnostics
@@ -55,7 +60,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._inputs: ImageInputs | None = None
         self._worker: Worker | None = None
         self._map: SavedMap | None = None
-        self._infos: list[Any] = []
+        self._others: list[Any] = []
         self._autosave: Autosave | None = None
         self._statistics = Statistics()
         self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
@@ -173,13 +178,11 @@ class PlaceRecognizerNode(LifecycleNode):
                 f"allowed: at least {per_keyframe / 1e6:.3g}, better a hundred times as much"
             )
         self._stamps = StampRule(config.on_stamp_back)
-        outputs = Outputs(self, config, describer.image_size)
+        poses = RelativePoses(recognizer)
+        outputs = Outputs(self, config, describer.image_size, poses)
         self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
-        self._infos = [
-            self.create_subscription(CameraInfo, topic, self._rectify(views[camera], camera), 1)
-            for topic, camera in zip(config.camera_info_topics, config.image_topics, strict=False)
-        ]
+        self._others = self._subscribe_others(recognizer, outputs, views, poses)
         self._map = SavedMap(database, describer.fingerprint)
         self._map.path = config.map_path
         if config.load_on_start:
@@ -217,13 +220,38 @@ class PlaceRecognizerNode(LifecycleNode):
             view.needs_info = bool(config.camera_info_topics)
         return views
 
-    def _rectify(self, view: View, camera: str) -> Callable[[CameraInfo], None]:
+    def _subscribe_others(
+        self, recognizer: PlaceRecognizer, outputs: Outputs, views: dict[str, View], poses: RelativePoses
+    ) -> list[Any]:
+        """Camera infos, odometry and poses, where topics are given."""
+        config = self.settings.node
+        cameras = zip(config.camera_info_topics, config.image_topics, strict=False)
+        others = [
+            self.create_subscription(CameraInfo, topic, self._calibrate(camera, views[camera], poses), 1)
+            for topic, camera in cameras
+        ]
+
+        def odometry(message: Odometry) -> None:
+            position = message.pose.pose.position
+            recognizer.odometry.add(stamp_of(message), position.x, position.y, position.z)
+            outputs.markers.track.add(message)
+
+        for kind, topic, receive in (
+            (Odometry, config.odometry_topic, odometry),
+            (PoseStamped, config.pose_topic, outputs.markers.track.add),
+        ):
+            if topic:
+                others.append(self.create_subscription(kind, topic, receive, qos_profile_sensor_data))
+        return others
+
+    def _calibrate(self, camera: str, view: View, poses: RelativePoses) -> Callable[[CameraInfo], None]:
         def receive(info: CameraInfo) -> None:
             try:
                 if view.rectifier is None or view.rectifier.size != (info.width, info.height):
                     view.rectifier = Rectifier(info)
+                    poses.cameras[camera] = view.intrinsics()
                     self.get_logger().info(f"images of {camera} are rectified as {info.width}x{info.height}")
-            except ImageError as error:
+            except PnvError as error:
                 self.get_logger().warning(f"camera info of {camera}: {error}", throttle_duration_sec=10.0)
 
         return receive
@@ -265,7 +293,7 @@ class PlaceRecognizerNode(LifecycleNode):
     def _free(self) -> None:
         if self._recognition is not None:
             self._recognition.outputs.close()
-            for subscription in self._infos:
+            for subscription in self._others:
                 self.destroy_subscription(subscription)
         if self._diagnostics is not None:
             self._diagnostics.close()

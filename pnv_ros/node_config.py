@@ -26,9 +26,11 @@ class NodeConfig:
         (), "pixels cut off at left, top, right, bottom before anything else is done", kind=int, unit="px", low=0
     )
     camera_info_topics: tuple[str, ...] = setting(
-        (), "CameraInfo topics, one per camera; images are then rectified before use", kind=str
+        (), "CameraInfo topics, one per camera; images are rectified by them, ~/relative_pose needs them", kind=str
     )
-    odometry_topic: str = setting("", "nav_msgs/Odometry that places keyframes in ~/markers")
+    odometry_topic: str = setting(
+        "", "nav_msgs/Odometry: rules closures out, scales ~/relative_pose, places keyframes in ~/markers"
+    )
     pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
 
     # Time

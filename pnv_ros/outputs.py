@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
@@ -13,7 +14,9 @@ from std_msgs.msg import Float64MultiArray
 from msg_adapters.lio_sam import LioSamGate
 from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam, closures_to_message
 from msg_adapters.pictures import rgb_to_message
+from msg_adapters.relative_pose import relative_pose_to_message
 from pnv_core.drawing import draw_match
+from pnv_core.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
@@ -28,18 +31,23 @@ PICTURE_QOS = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE)
 class Outputs:
     """The publishers of a configured node. `config` may be replaced between frames."""
 
-    def __init__(self, node: Node, config: NodeConfig, picture_size: tuple[int, int]) -> None:
-        self.markers = Markers(node, config)
+    def __init__(
+        self, node: Node, config: NodeConfig, picture_size: tuple[int, int], poses: RelativePoses | None = None
+    ) -> None:
+        self.markers, self._poses = Markers(node, config), poses
         self._node, self.config, self._size = node, config, picture_size
         self._cameras = config.image_topics
         self._closures = node.create_publisher(Float64MultiArray, "loop_closures", CLOSURES_QOS)
         self._lio_sam = node.create_publisher(Float64MultiArray, "~/lio_sam", TABLE_QOS)
+        self._relative_pose = node.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", TABLE_QOS)
         self._candidates = node.create_publisher(PointCloud2, "~/candidates", TABLE_QOS)
         self._match_image = node.create_publisher(Image, "~/match_image", PICTURE_QOS)
         self._lio_sam_gate = LioSamGate()
 
     def close(self) -> None:
-        for publisher in (self._closures, self._lio_sam, self._candidates, self._match_image):
+        for publisher in (
+            self._closures, self._lio_sam, self._relative_pose, self._candidates, self._match_image
+        ):  # fmt: skip
             self._node.destroy_publisher(publisher)
         self.markers.close()
 
@@ -55,6 +63,7 @@ class Outputs:
         if accepted:
             self._closures.publish(closures_to_message(accepted, self._cameras))
             self._publish_lio_sam(accepted)
+            self._publish_relative_pose(accepted[0])
             self.markers.add(accepted)
         if self.config.publish_candidates and self._candidates.get_subscription_count():
             self._candidates.publish(candidates_to_message(closures, self._cameras, self.config.frame_id))
@@ -68,6 +77,13 @@ class Outputs:
         best = self._lio_sam_gate.chosen(accepted, self.config.lio_sam_interval_s, self.config.lio_sam_gap_s)
         if best is not None:
             self._lio_sam.publish(closure_to_lio_sam(best))
+
+    def _publish_relative_pose(self, best: LoopClosure) -> None:
+        if self._poses is None or not self._relative_pose.get_subscription_count():
+            return
+        pose = self._poses.of(best)
+        if pose is not None and pose.metric:
+            self._relative_pose.publish(relative_pose_to_message(best, pose))
 
     def _picture(self, frame: Frame, closure: LoopClosure, reference: bytes) -> Image:
         verdict = "accepted" if closure.accepted else f"refused: {closure.reason}"

@@ -114,8 +114,8 @@ Names without a leading slash are relative to the node's namespace, `~` is the n
 | --- | --- | --- | --- |
 | `image_topics` (`camera/image_raw`) | sensor_msgs/Image or CompressedImage | {image_qos}, depth 2 | the cameras |
 | `camera_info_topics` (none) | sensor_msgs/CameraInfo | reliable, volatile | optional; images are rectified by it |
-| `odometry_topic` (none) | nav_msgs/Odometry | best effort, volatile | optional; places keyframes in `~/markers` |
-| `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; as above |
+| `odometry_topic` (none) | nav_msgs/Odometry | best effort, volatile | optional; rules closures out, places keyframes |
+| `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; places keyframes in `~/markers` |
 
 `transport: auto` takes the message type that is published. Of Image these encodings are understood: {encodings};
 row padding and byte order are honoured, 16 bit grey is scaled by the bits in use. CompressedImage is jpeg or png, 8 or
@@ -136,6 +136,7 @@ match is reported with both profiles and the override to set.
 | --- | --- | --- | --- |
 | `loop_closures` | std_msgs/Float64MultiArray | {closures_qos} | per query with an accepted closure |
 | `~/lio_sam` | std_msgs/Float64MultiArray | {table_qos} | best closure, limited by `lio_sam_interval_s` |
+| `~/relative_pose` | geometry_msgs/PoseWithCovarianceStamped | {table_qos} | best closure, where its scale is known |
 | `~/candidates` | sensor_msgs/PointCloud2 | {table_qos} | per query, while somebody subscribes |
 | `~/match_image` | sensor_msgs/Image | {picture_qos} | per query, while somebody subscribes |
 | `~/markers` | visualization_msgs/MarkerArray | {markers_qos} | on change, while somebody subscribes |
@@ -148,6 +149,9 @@ match older; the exact stamp is (floor(column 0), column 5) and (floor(column 1)
 `msg_adapters.loop_closures.closures_from_message` reads it.
 
 **`~/lio_sam`**: exactly two doubles, query and match in epoch seconds, at least `lio_sam_gap_s` apart.
+
+**`~/relative_pose`**: the query's camera (optical frame) in the frame `keyframe_<match id>`, in metres. It needs
+`camera_info_topics` and, for the scale, `odometry_topic`; sent while somebody subscribes.
 
 **`~/candidates`**: every candidate examined, refused ones too, one point each: {candidate_fields}. Reasons:
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msg_adapters.camera_info import Rectifier
 from msg_adapters.images import MIN_SIDE
 from pnv_core.errors import ConfigError, ImageError
+from pnv_core.geometry import Intrinsics
 from pnv_core.types import Frame
 
 
@@ -36,6 +37,12 @@ class View:
         window = slice(top, height - bottom), slice(left, width - right)
         return dataclasses.replace(frame, rgb=np.ascontiguousarray(rgb[window]),
                                    valid=None if valid is None else valid[window] > 127)  # fmt: skip
+
+    def intrinsics(self) -> Intrinsics:
+        """Of the images this view gives. To be called once the rectifier is known; raises ConfigError."""
+        assert self.rectifier is not None
+        (fx, fy, cx, cy), (left, top, right, _) = self.rectifier.focal_and_centre, self._crop
+        return Intrinsics.of_pixels(fx, fy, cx - left, cy - top, self.rectifier.size[0] - left - right)
 
     def _valid(self, width: int, height: int) -> NDArray[np.uint8] | None:
         if self._mask is None or self._mask.shape == (height, width):

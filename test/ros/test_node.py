@@ -7,12 +7,14 @@ import cv2
 import numpy as np
 import pytest
 from lifecycle_msgs.msg import State, Transition
+from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Float64MultiArray
 from visualization_msgs.msg import MarkerArray
 
 from msg_adapters.loop_closures import closures_from_message
+from pnv_core.types import Reason
 from pnv_ros.markers import MARKERS_QOS
 from pnv_ros.outputs import CLOSURES_QOS
 from test.ros.camera import EPOCH_S, Camera, Health, compressed, image, scene
@@ -60,12 +62,9 @@ def test_the_life_cycle_keeps_the_map_when_inactive_and_frees_it_on_clean_up(dom
     ("parameters", "words"),
     [
         ({"accept_score": 1.5}, "accept_score"),
-        ({"scorer": "guess"}, "scorer = 'guess' is out of range; allowed: one of ransac, rapid"),
-        ({"weights": "/no/such/model"}, "no such file"),
         ({"image_topics": ["a", "a"]}, "allowed: one or more different topic names"),
         ({"memory_budget_mb": 1, "image_width": 1280, "image_height": 960, "patch_precision": "float32"},
          "holds no keyframe"),
-        ({"masks": ["/no/such/mask.png"]}, "mask '/no/such/mask.png' is no file"),
     ],
 )  # fmt: skip
 def test_a_start_with_unusable_settings_ends_with_status_2_and_one_line(domain, parameters, words):
@@ -194,6 +193,28 @@ def test_mask_crop_and_camera_info_shape_what_is_looked_at(domain, listener, tmp
         camera.send(image(scene(1, 160, 120), at(2)))
         node.wait_for("image is 160x120; allowed by its camera info: 320x240")
         assert health.fresh().level == b"\x01"
+        assert node.end() == 0
+
+
+def test_odometry_rules_out_a_closure_and_places_the_keyframes(domain, listener):
+    health = Health(listener)
+    tables = listener.collect(PointCloud2, f"{NODE}/candidates")
+    markers = listener.collect(MarkerArray, f"{NODE}/markers", MARKERS_QOS)
+    with running_node(odometry_topic="odom", accept_score=0.0, **EAGER) as node:
+        camera = Camera(listener, health, "camera/image_raw")
+        odometry = listener.node.create_publisher(Odometry, "odom", 10)
+        wait_until(odometry.get_subscription_count, 10, "odometry")
+        for seconds, x in ((0, 0.0), (60, 10_000.0)):
+            sample = Odometry()
+            sample.header.stamp.sec, sample.header.frame_id, sample.pose.pose.position.x = EPOCH_S + seconds, "odom", x
+            odometry.publish(sample)
+            time.sleep(0.5)
+            camera.send(image(scene(1), at(seconds)))
+        best = rows_of(wait_until(lambda: tables, 20, "candidates")[0])[0]
+        assert (best["accepted"], best["reason"]) == (0, list(Reason).index(Reason.ODOMETRY))
+        newest = wait_until(lambda: markers and len(markers[-1].markers[0].points) == 2 and markers[-1], 10, "markers")
+        assert [p.x for p in newest.markers[0].points] == [0.0, 10_000.0]
+        assert newest.markers[0].header.frame_id == "odom"
         assert node.end() == 0
 
 
