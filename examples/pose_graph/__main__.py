@@ -10,6 +10,7 @@ import csv
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +18,19 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from scipy.spatial.transform import Rotation
 
-from examples.pose_graph.back_end import BackEndNode
+from examples.pose_graph.back_end import BackEndNode, Recording
 from examples.pose_graph.drift import drifted
 from examples.pose_graph.graph import PoseGraph
-from examples.pose_graph.report import Result, plot, print_table, write_tables
+from examples.pose_graph.report import Result, plot, print_table, trial, write_tables
 from examples.pose_graph.sequences import Array, Walk, walks
 from examples.processes import isolated_environment, node_process, publisher_process
 from examples.publisher import IMAGE_TOPIC, INFO_TOPIC, ODOMETRY_TOPIC
+from examples.sources import add_source_flags, named_frames
+from pnv_core import load_describer
 from pnv_core.errors import PnvError
-from pnv_core.types import LoopClosure
+from pnv_core.geometry import Intrinsics
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.relative_poses import RelativePoses
 
 _LATE_S, _LATEST_S = 4.0, 20.0  # the node may still work on the last frames
 _SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -37,6 +42,7 @@ def main() -> int:
     parser.add_argument("--data", type=Path, default=_SHARED, help="folder of recorded walks; default ../shared/data")
     parser.add_argument("--seed", type=int, default=0, help="of the odometry's drift")
     parser.add_argument("--trials", type=int, default=10, help="further drifts each walk's closures are tried with")
+    parser.add_argument("--offline", action="store_true", help="no processes: the recogniser itself, every frame")
     parser.add_argument("--parameter", action="append", default=[], metavar="NAME:=VALUE", help="of the node")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of what is written; default out")
     args = parser.parse_args()
@@ -46,8 +52,12 @@ def main() -> int:
         results = []
         for walk in chosen:
             odometry = drifted(walk.truth, walk.drift, args.seed)
-            closures, corrected = live(walk, odometry, args.parameter)
-            results.append(Result.of(walk, odometry, corrected, closures, args.trials))
+            if args.offline:
+                recording = recorded(walk, odometry)
+                corrected = trial(walk, odometry, recording, robust=True)
+            else:
+                recording, corrected = live(walk, odometry, args.parameter)
+            results.append(Result.of(walk, odometry, corrected, recording, args.trials))
             print(results[-1].sentence(), flush=True)
     except PnvError as error:
         print(f"slam-demo: {error}", file=sys.stderr)
@@ -62,8 +72,31 @@ def main() -> int:
     return 0 if results and all(result.halved for result in results) else 1
 
 
-def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[LoopClosure], Array]:
-    """Play a walk through node and back end: the closures that arrived and the corrected poses (n, 4, 4)."""
+def recorded(walk: Walk, odometry: Array) -> Recording:
+    """What the recogniser says when it is given every frame, whatever time that takes: the same on any machine."""
+    parser = argparse.ArgumentParser()
+    add_source_flags(parser)
+    describer = load_describer("default", **walk.parameters)
+    recognizer = PlaceRecognizer(describer.config, describer)
+    relative, recording = RelativePoses(recognizer), Recording()
+    positions = dict(zip(walk.stamps_ns, odometry[:, :3, 3], strict=True))
+    for _, frame in named_frames(parser.parse_args(walk.flags)):
+        recognizer.odometry.add(frame.stamp_ns, *positions[frame.stamp_ns])
+        if walk.intrinsics:
+            relative.cameras[frame.camera] = Intrinsics.of_pixels(*walk.intrinsics, frame.rgb.shape[1])
+        for closure in recognizer.process(frame):
+            if closure.accepted:
+                recording.closures.append(replace(closure, matches=()))
+                pose = relative.of(closure)
+                if pose is not None and pose.covariance is not None:
+                    camera = np.eye(4)
+                    camera[:3, :3], camera[:3, 3] = pose.rotation, pose.translation
+                    recording.measured[closure.query.stamp_ns, closure.match.id] = camera, pose.covariance
+    return recording
+
+
+def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[Recording, Array]:
+    """Play a walk through node and back end: what arrived and the corrected poses (n, 4, 4)."""
     environment = isolated_environment()
     rclpy.init(args=[])
     back_end = BackEndNode(PoseGraph(walk.noise))
@@ -95,7 +128,7 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[list[Loop
             if len(back_end.back_end.stamps) != len(walk.stamps_ns):
                 count = len(back_end.back_end.stamps)
                 raise PnvError(f"{walk.name}: {count} of {len(walk.stamps_ns)} odometry messages arrived")
-            return [closure for closure, _, _ in back_end.back_end.used], back_end.back_end.graph.poses
+            return back_end.back_end.recording, back_end.back_end.graph.poses
         finally:
             back_end.destroy_node()
             rclpy.try_shutdown()

@@ -5,8 +5,8 @@ closures; publishes `corrected_path` (nav_msgs/Path). The camera is taken to loo
 """
 
 import time
-from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
@@ -21,73 +21,90 @@ from examples.listener import CLOSURES_QOS, NODE
 from examples.pose_graph.graph import Loop, PoseGraph
 from msg_adapters.images import stamp_of
 from msg_adapters.loop_closures import closures_from_message, to_time
+from msg_adapters.stamp_ids import NodePair, StampIds
 from pnv_core.types import LoopClosure
 from pnv_core.worlds import CAMERA_IN_BODY
 
 Array = NDArray[np.float64]
 
-NEAREST_NS = 500_000_000  # a closure's images have a pose at most this far in time, or there is none
 _PATH_QOS = QoSProfile(
     depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 )
 
 
+@dataclass(frozen=True)
+class Recording:
+    """What the recogniser said about a walk: closures, and measured relative poses by query stamp and match id.
+
+    A relative pose is the query's camera (4, 4) in the match's optical frame with its covariance (6, 6).
+    """
+
+    closures: list[LoopClosure] = field(default_factory=list)
+    measured: dict[tuple[int, int], tuple[Array, Array]] = field(default_factory=dict)
+
+
 class BackEnd:
-    """The graph by stamps, without ROS: closures wait for their poses, each that has none is dropped."""
+    """The graph by stamps, without ROS: closures wait for their poses, those that never get one are dropped."""
 
     def __init__(self, graph: PoseGraph) -> None:
         self.graph = graph
         self.stamps: list[int] = []
-        self.used: list[tuple[LoopClosure, int, int]] = []  # with the nodes of query and match
-        self.dropped: list[LoopClosure] = []
-        self.measured: dict[tuple[int, int], tuple[Array, Array]] = {}
-        self._waiting: list[LoopClosure] = []
+        self.used: list[NodePair] = []
+        self._nodes = StampIds()
+        self._measured: dict[tuple[int, int], tuple[Array, Array]] = {}
         self._fresh = False
 
     def add_odometry(self, stamp_ns: int, pose: Array) -> None:
         """A pose (4, 4); stamps that do not grow are ignored."""
-        if self.stamps and stamp_ns <= self.stamps[-1]:
-            return
-        self.stamps.append(stamp_ns)
-        self.graph.add_odometry(pose)
+        if not self.stamps or stamp_ns > self.stamps[-1]:
+            self.stamps.append(stamp_ns)
+            self._take(self._nodes.add_node(self.graph.add_odometry(pose), stamp_ns))
 
     def add_closures(self, closures: Sequence[LoopClosure]) -> None:
-        self._waiting += closures
+        for closure in closures:
+            self._take(self._nodes.add_closure(closure))
+
+    def _take(self, pairs: Sequence[NodePair]) -> None:
+        self.used += pairs
+        self._fresh |= bool(pairs)
 
     def add_relative_pose(self, query_ns: int, match_id: int, camera: Array, covariance: Array) -> None:
         """The query's camera (4, 4) in the match's optical frame, and its covariance (6, 6), position first."""
-        turn = np.eye(4)
-        turn[:3, :3] = CAMERA_IN_BODY
-        both = np.kron(np.eye(2), CAMERA_IN_BODY)
-        self.measured[query_ns, match_id] = turn @ camera @ turn.T, both @ covariance @ both.T
+        self._measured[query_ns, match_id] = camera, covariance
         self._fresh = True
 
-    def update(self) -> bool:
-        """Take the closures whose poses are there and optimise; whether anything was new."""
-        ready = [c for c in self._waiting if self.stamps and c.query.stamp_ns <= self.stamps[-1]]
-        self._waiting = [c for c in self._waiting if c not in ready]
-        for closure in ready:
-            query, match = self.nearest(closure.query.stamp_ns), self.nearest(closure.match.stamp_ns)
-            if query is None or match is None:
-                self.dropped.append(closure)
-            else:
-                self.used.append((closure, query, match))
-        changed = bool(ready) or self._fresh
-        if changed:
-            self._fresh = False
-            self.graph.loops = [
-                Loop(query, match, c.score, *self.measured.get((c.query.stamp_ns, c.match.id), (None, None)))
-                for c, query, match in self.used
-            ]
-            self.graph.optimise()
-        return changed
+    def play(self, recording: Recording) -> None:
+        """Take everything of a recording."""
+        self.add_closures(recording.closures)
+        for (query_ns, match_id), (camera, covariance) in recording.measured.items():
+            self.add_relative_pose(query_ns, match_id, camera, covariance)
 
-    def nearest(self, stamp_ns: int) -> int | None:
-        """The node nearest in time; None where it is too far."""
-        after = bisect_left(self.stamps, stamp_ns)
-        near = [node for node in (after - 1, after) if 0 <= node < len(self.stamps)]
-        best = min(near, key=lambda node: abs(self.stamps[node] - stamp_ns), default=None)
-        return best if best is not None and abs(self.stamps[best] - stamp_ns) <= NEAREST_NS else None
+    @property
+    def recording(self) -> Recording:
+        """What was taken so far."""
+        return Recording([pair.closure for pair in self.used], dict(self._measured))
+
+    @property
+    def dropped(self) -> int:
+        """Closures that no odometry was near to in time."""
+        return self._nodes.dropped
+
+    def update(self) -> bool:
+        """Optimise if there is anything new, and say whether there was."""
+        fresh, self._fresh = self._fresh, False
+        if fresh:
+            self.graph.loops = [self._loop(pair) for pair in self.used]
+            self.graph.optimise()
+        return fresh
+
+    def _loop(self, pair: NodePair) -> Loop:
+        measured = self._measured.get((pair.closure.query.stamp_ns, pair.closure.match.id))
+        if measured is None:
+            return Loop(pair.query, pair.match, pair.closure.score)
+        camera, covariance = measured
+        turn, both = np.eye(4), np.kron(np.eye(2), CAMERA_IN_BODY)
+        turn[:3, :3] = CAMERA_IN_BODY
+        return Loop(pair.query, pair.match, pair.closure.score, turn @ camera @ turn.T, both @ covariance @ both.T)
 
 
 class BackEndNode(Node):
@@ -125,13 +142,7 @@ class BackEndNode(Node):
 
     def correct(self) -> None:
         """Optimise if there are new closures, and publish the path."""
-        dropped = len(self.back_end.dropped)
-        changed = self.back_end.update()
-        for closure in self.back_end.dropped[dropped:]:
-            self.get_logger().warning(
-                f"no odometry within 0.5 s of {closure.query.stamp_ns} or {closure.match.stamp_ns}: closure dropped"
-            )
-        if changed or len(self.back_end.stamps):
+        if self.back_end.update() or self.back_end.stamps:
             self._path.publish(path_message(self.back_end.stamps, self.back_end.graph.poses))
 
 

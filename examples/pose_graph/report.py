@@ -11,7 +11,7 @@ from evo.core.trajectory import PosePath3D
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from examples.pose_graph.back_end import BackEnd
+from examples.pose_graph.back_end import BackEnd, Recording
 from examples.pose_graph.drift import drifted
 from examples.pose_graph.graph import PoseGraph
 from examples.pose_graph.sequences import Walk
@@ -45,16 +45,17 @@ class Result:
     walk: Walk
     odometry: Array
     corrected: Array
-    closures: list[LoopClosure]
+    recording: Recording
     before_m: float
     after_m: float
     trials: list[Trials]
 
     @classmethod
-    def of(cls, walk: Walk, odometry: Array, corrected: Array, closures: list[LoopClosure], trials: int) -> "Result":
+    def of(cls, walk: Walk, odometry: Array, corrected: Array, recording: Recording, trials: int) -> "Result":
         before, after = trajectory_error(walk.truth, odometry), trajectory_error(walk.truth, corrected)
-        tried = [_trials(walk, closures, share, trials) for share in (0.0, 0.1, 0.3)] if closures else []
-        return cls(walk, odometry, corrected, closures, before, after, tried)
+        shares = (0.0, 0.1, 0.3) if recording.closures else ()
+        tried = [_trials(walk, recording, share, trials) for share in shares]
+        return cls(walk, odometry, corrected, recording, before, after, tried)
 
     @property
     def halved(self) -> bool:
@@ -62,28 +63,28 @@ class Result:
 
     def sentence(self) -> str:
         return (
-            f"{self.walk.name}: {len(self.closures)} closures, "
+            f"{self.walk.name}: {len(self.recording.closures)} closures, {len(self.recording.measured)} measured, "
             f"trajectory error {self.before_m:.2f} m before, {self.after_m:.2f} m after"
         )
 
 
-def _trials(walk: Walk, closures: Sequence[LoopClosure], share: float, count: int) -> Trials:
-    robust, plain, false = [], [], round(share * len(closures))
+def _trials(walk: Walk, recording: Recording, share: float, count: int) -> Trials:
+    robust, plain, false = [], [], round(share * len(recording.closures))
     for seed in range(1, count + 1):
         odometry = drifted(walk.truth, walk.drift, seed)
         before = trajectory_error(walk.truth, odometry)
-        injected = [*closures, *false_closures(walk, false, seed)]
+        injected = Recording([*recording.closures, *false_closures(walk, false, seed)], recording.measured)
         robust.append(trajectory_error(walk.truth, trial(walk, odometry, injected, True)) / before)
         plain.append(trajectory_error(walk.truth, trial(walk, odometry, injected, False)) / before)
     return Trials(false, robust, plain)
 
 
-def trial(walk: Walk, odometry: Array, closures: Sequence[LoopClosure], robust: bool) -> Array:
-    """The corrected poses (n, 4, 4) that the back end gives for an odometry and closures."""
+def trial(walk: Walk, odometry: Array, recording: Recording, robust: bool) -> Array:
+    """The corrected poses (n, 4, 4) that the back end gives for an odometry and a recording."""
     back_end = BackEnd(PoseGraph(walk.noise, robust))
     for stamp, pose in zip(walk.stamps_ns, odometry, strict=True):
         back_end.add_odometry(stamp, pose)
-    back_end.add_closures(closures)
+    back_end.play(recording)
     back_end.update()
     return back_end.graph.poses
 
@@ -109,7 +110,7 @@ def print_table(results: Sequence[Result]) -> None:
         way = np.linalg.norm(np.diff(result.walk.truth[:, :3, 3], axis=0), axis=1).sum()
         ratio = result.after_m / result.before_m
         print(
-            f"{result.walk.name:<16}{way:>5.0f} m{len(result.closures):>10}{result.before_m:>7.2f} m"
+            f"{result.walk.name:<16}{way:>5.0f} m{len(result.recording.closures):>10}{result.before_m:>7.2f} m"
             f"{result.after_m:>7.2f} m{ratio:>8.2f}",
             end="",
         )
@@ -120,7 +121,7 @@ def print_table(results: Sequence[Result]) -> None:
     print(f"\n{'false closures added':<34}{'robust: median (worst)':<26}least squares: median (worst)")
     for result in results:
         for tried in result.trials[1:]:
-            name = f"{result.walk.name}, {tried.false} to {len(result.closures)}"
+            name = f"{result.walk.name}, {tried.false} to {len(result.recording.closures)}"
             print(f"{name:<34}{_summary(tried.robust):<26}{_summary(tried.plain)}")
     print()
 
@@ -135,12 +136,14 @@ def write_tables(results: Sequence[Result], folder: Path) -> None:
         writer = csv.writer(file)
         writer.writerow(["walk", "closures", "false", "solution", "before_m", "after_m", "ratio"])
         for r in results:
-            row = [r.walk.name, len(r.closures), 0, "live", f"{r.before_m:.4f}", f"{r.after_m:.4f}"]
+            row = [r.walk.name, len(r.recording.closures), 0, "live", f"{r.before_m:.4f}", f"{r.after_m:.4f}"]
             writer.writerow([*row, f"{r.after_m / r.before_m:.4f}"])
             for tried in r.trials:
                 for solution, ratios in (("robust", tried.robust), ("least squares", tried.plain)):
                     for ratio in ratios:
-                        writer.writerow([r.walk.name, len(r.closures), tried.false, solution, "", "", f"{ratio:.4f}"])
+                        writer.writerow(
+                            [r.walk.name, len(r.recording.closures), tried.false, solution, "", "", f"{ratio:.4f}"]
+                        )
     for r in results:
         for kind, poses in (("truth", r.walk.truth), ("odometry", r.odometry), ("corrected", r.corrected)):
             quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
@@ -170,7 +173,7 @@ def plot(results: Sequence[Result], path: Path) -> None:
         axes.plot(*result.walk.truth[:, :2, 3].T, color="0.55", linewidth=3, alpha=0.6, label="truth")
         for label, poses, colour in drawn:
             axes.plot(*poses[:, :2, 3].T, color=colour, linewidth=1.2, label=label)
-        for closure in result.closures:
+        for closure in result.recording.closures:
             ends = [stamps.get(ref.stamp_ns) for ref in (closure.query, closure.match)]
             if None not in ends:
                 axes.plot(*drawn[1][1][ends, :2, 3].T, color="#009e73", linewidth=0.6, alpha=0.6)

@@ -6,7 +6,7 @@ import pytest
 pytest.importorskip("gtsam", reason="the SLAM example needs GTSAM")
 pytest.importorskip("evo", reason="the SLAM example needs evo")
 
-from examples.pose_graph.back_end import BackEnd, path_message, pose_matrix
+from examples.pose_graph.back_end import BackEnd, Recording, path_message, pose_matrix
 from examples.pose_graph.drift import Drift, drifted
 from examples.pose_graph.graph import Loop, Noise, PoseGraph
 from examples.pose_graph.report import false_closures, trajectory_error, trial
@@ -31,7 +31,7 @@ def walk():
 
 
 @pytest.fixture(scope="module")
-def true_closures(walk) -> list[LoopClosure]:
+def true_closures(walk) -> Recording:
     """What a good recogniser says: now and then, a frame within 1.5 m of the query, seldom the nearest."""
     rng = np.random.default_rng(3)
     positions, stamps = walk.truth[:, :3, 3], walk.stamps_ns
@@ -40,7 +40,7 @@ def true_closures(walk) -> list[LoopClosure]:
         near = np.flatnonzero(np.linalg.norm(positions[: query - 60] - positions[query], axis=1) < 1.5)
         if len(near):
             closures.append(_closure(stamps[query], stamps[int(rng.choice(near))]))
-    return closures
+    return Recording(closures)
 
 
 def test_exact_odometry_stays_exact_without_closures() -> None:
@@ -74,7 +74,8 @@ def test_the_robust_solution_survives_false_closures_that_ruin_least_squares(wal
     errors = []
     for seed in range(6):
         odometry = drifted(walk.truth, walk.drift, seed)
-        injected = [*true_closures, *false_closures(walk, len(true_closures) // 2, seed)]
+        false = false_closures(walk, len(true_closures.closures) // 2, seed)
+        injected = Recording(true_closures.closures + false)
         tried = ((true_closures, True), (injected, True), (injected, False))
         errors.append([trajectory_error(walk.truth, trial(walk, odometry, c, robust)) for c, robust in tried])
     clean, robust, plain = np.array(errors).T
@@ -88,12 +89,13 @@ def test_closures_wait_for_their_odometry_and_are_dropped_where_there_is_none() 
     for number, pose in enumerate(_circle(5, 0.1)):
         back_end.add_odometry(number * second, pose)
     back_end.add_closures([_closure(9 * second, 0)])
+    back_end.add_closures([_closure(6 * second + 300_000_000, second)])
     assert not back_end.update()
-    back_end.add_odometry(20 * second, Pose(0, 0).matrix())
+    back_end.add_odometry(6 * second + 400_000_000, Pose(0, 0).matrix())
     assert back_end.update()
-    assert len(back_end.dropped) == 1
-    assert back_end.nearest(second + 400_000_000) == 1
-    assert back_end.nearest(12 * second) is None
+    assert [(pair.query, pair.match) for pair in back_end.used] == [(5, 1)]
+    back_end.add_odometry(30 * second, Pose(0, 0).matrix())
+    assert back_end.dropped == 1
 
 
 def test_a_loop_to_a_node_that_does_not_exist_is_refused() -> None:
