@@ -28,33 +28,42 @@ from pnv_core.weights import resolve_weights
 
 
 class RememberedDescriber:
-    """A describer that knows the images of one sequence by heart; it gives them in the order they are asked for."""
+    """A describer that knows the images of one sequence by heart, once it has seen them. `at` is the image's number."""
 
     def __init__(self, describer: Describer, images: TruthSequence, cache: Path) -> None:
         self.config, self.model, self.fingerprint = describer.config, describer.model, describer.fingerprint
         self.at = 0
+        self._describer = describer
         folder = cache / f"{describer.fingerprint[:12]}_{self.config.image_width}x{self.config.image_height}"
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / f"{images.name}_{zlib.crc32(chr(10).join(images.keys).encode()):08x}.npz"
-        if not file.exists():
-            described = [describer.describe(frame.rgb) for frame in images.frames()]
-            patches = {
-                f"patches_{i}": np.stack([d.patches[i].descriptors.astype(np.float16) for d in described])
-                for i in range(len(self.config.patch_sizes))
-            }
-            vectors = np.stack([d.global_vector for d in described])
-            np.savez(file, vectors=vectors, texture=np.array([d.texture for d in described]), **patches)
-        with np.load(file) as stored:
-            self._stored = {name: stored[name] for name in stored.files}
-        self._grids = describer.grids()
+        keys = zlib.crc32("\n".join(images.keys).encode())
+        self._file = folder / f"{images.name}_{keys:08x}.npz"
+        self._known: dict[int, PlaceDescriptor] = {}
+        if self._file.exists():
+            with np.load(self._file) as stored:
+                arrays = {name: stored[name] for name in stored.files}
+            for row, number in enumerate(arrays["numbers"]):
+                patches = tuple(
+                    PatchGrid(size, rows, cols, arrays[f"patches_{n}"][row].astype(np.float32), stride)
+                    for n, (size, stride, rows, cols) in enumerate(describer.grids())
+                )
+                texture = float(arrays["texture"][row])
+                self._known[int(number)] = PlaceDescriptor(arrays["vectors"][row], patches, texture)
 
     def describe(self, rgb: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> PlaceDescriptor:
-        s, i = self._stored, self.at
-        patches = tuple(
-            PatchGrid(size, rows, cols, s[f"patches_{n}"][i].astype(np.float32), stride)
-            for n, (size, stride, rows, cols) in enumerate(self._grids)
-        )
-        return PlaceDescriptor(s["vectors"][i], patches, float(s["texture"][i]))
+        if self.at not in self._known:
+            self._known[self.at] = self._describer.describe(rgb, valid)
+        return self._known[self.at]
+
+    def save(self) -> None:
+        numbers = sorted(self._known)
+        known = [self._known[i] for i in numbers]
+        patches = {
+            f"patches_{n}": np.stack([d.patches[n].descriptors.astype(np.float16) for d in known])
+            for n in range(len(self.config.patch_sizes))
+        }
+        vectors, texture = np.stack([d.global_vector for d in known]), np.array([d.texture for d in known])
+        np.savez(self._file, numbers=numbers, vectors=vectors, texture=texture, **patches)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +110,7 @@ def judged(images: TruthSequence, describer: Describer, cache: Path, **settings)
             elif images.queries is not None and old and not images.starts:  # no loop is known here: closures are false
                 queries.append([(c, images.truth(i, image_of[c.match.id])) for c in closures])
                 loops.append(False)
+    remembered.save()
     return Judged(images.name, queries, np.array(loops, bool))
 
 

@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
-from scipy.optimize import minimize
 
 from pnv_core.config import Config
 from pnv_core.errors import ModelError
@@ -27,21 +26,26 @@ Array = NDArray[np.float64]
 _CHANCE = 8  # as many local features agree on some epipolar geometry by chance
 _LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
 
-# Every feature grows with the belief in the candidate.
-_PATCH_FEATURES: dict[str, Callable[[Evidence], float]] = {
-    "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
-    "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
-    "spread": lambda e: e.spread,
-    "similarity": lambda e: e.similarity,
-    "lead": lambda e: max(e.lead, 0.0),
-    "recent_lead": lambda e: e.recent_lead,
-    "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
+# Every feature grows with the belief in the candidate. Similarity and the leads are left out where local features
+# speak: fitted on some sets and judged on others they cost more than they give, as their scale is that of a place.
+_FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
+    "patches": {
+        "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
+        "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
+        "spread": lambda e: e.spread,
+        "similarity": lambda e: e.similarity,
+        "lead": lambda e: max(e.lead, 0.0),
+        "recent_lead": lambda e: e.recent_lead,
+        "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
+    },
+    "verified": {
+        "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
+        "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
+        "local_inliers": lambda e: math.log(max(e.local_inliers, _CHANCE) / _CHANCE),
+        "local_spread": lambda e: e.local_spread,
+    },
 }
-_LOCAL_FEATURES: dict[str, Callable[[Evidence], float]] = {
-    "local_inliers": lambda e: math.log(max(e.local_inliers, _CHANCE) / _CHANCE),
-    "local_spread": lambda e: e.local_spread,
-}
-_FEATURES = {"patches": _PATCH_FEATURES, "verified": _PATCH_FEATURES | _LOCAL_FEATURES}
+_VALUES = _FEATURES["patches"] | _FEATURES["verified"]
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,7 @@ class Logistic:
     weights: dict[str, float]
 
     def probability(self, evidence: Evidence) -> float:
-        known = _FEATURES["verified"]
-        logit = self.bias + sum(weight * known[name](evidence) for name, weight in self.weights.items())
+        logit = self.bias + sum(weight * _VALUES[name](evidence) for name, weight in self.weights.items())
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
 
 
@@ -168,6 +171,8 @@ def _fit_logistic(
         return float(share @ np.logaddexp(0.0, -margin) + 0.5 * penalty @ theta), gradient + penalty
 
     bounds = [(None, None)] + [(0.0, None)] * table.shape[1]
+    from scipy.optimize import minimize  # half a second that recognition need not wait for at start
+
     theta = minimize(loss, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
     slopes = theta[1:] / scale
     return Logistic(
