@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pnv_core.errors import ConfigError
 from pnv_core.local_features import WIDTH, EpipolarCheck
@@ -122,6 +121,8 @@ def _refined(rotation: Array, translation: Array, a: Array, b: Array, noise: flo
         ea, eb = ha @ e.T, hb @ e
         residual = (hb * ea).sum(1)
         return residual / np.sqrt((ea[:, :2] ** 2).sum(1) + (eb[:, :2] ** 2).sum(1) + 1e-18) / noise
+
+    from scipy.optimize import least_squares  # slow to import, and not needed to recognise
 
     return pose(least_squares(sampson, np.zeros(5), loss="soft_l1", max_nfev=30).x)
 
