@@ -7,6 +7,7 @@ several workers or several machines give the same files.
 import hashlib
 import json
 import multiprocessing
+import signal
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -168,6 +169,7 @@ _worker_extractor: Extractor | None = None  # of a worker process, made once
 
 def _start_worker(extraction: Extraction) -> None:
     global _worker_extractor
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches every process of the terminal; the parent ends these
     _worker_extractor = extraction.open()
 
 
