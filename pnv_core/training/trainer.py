@@ -43,6 +43,7 @@ class TrainOptions:
     patch_temperature: float = 0.07
     anchor: float = 0.0  # pull of the trunk towards where it started (L2-SP, Li et al., ICML 2018)
     average: float = 0.995  # decay of the running average of weights that is kept
+    blend: float = 0.5  # share of the trained weights in what is given, the rest is the start (WiSE-FT, CVPR 2022)
     warmup: int = 50
     validate_every: int = 450
     save_every: int = 50
@@ -95,7 +96,7 @@ class Trainer:
     def run(
         self, progress: Callable[[Iterator[Batch], int, int], Iterator[Batch]] = lambda batches, done, total: batches
     ) -> Model:
-        """Train to the last step and give the model with averaged weights."""
+        """Train to the last step and give the model with averaged weights, blended with those it started from."""
         torch.manual_seed(self.options.seed)
         if self.step == 0:
             self._validate()
@@ -111,7 +112,9 @@ class Trainer:
                 self._save()
             if self.step % self.options.validate_every == 0 or self.step == self.options.steps:
                 self._validate()
-        self._use_average()
+        with torch.no_grad():
+            for name, parameter in self.parts.named_parameters():
+                parameter.copy_(self.start[name].lerp(self.average[name], self.options.blend))
         for part in self.parts.values():
             part.eval().requires_grad_(False)
         return self.model
