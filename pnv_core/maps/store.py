@@ -291,6 +291,8 @@ def locked(folder: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise MapError(f"{folder} is being saved by another process") from error
+        except OSError as error:
+            raise MapError(f"cannot lock {folder}: {error.strerror}; allowed: a file system with locks") from error
         yield
     finally:
         os.close(handle)
