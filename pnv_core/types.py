@@ -5,6 +5,7 @@ D = descriptor dimension, rows x cols = patch grid of one patch size.
 
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,15 +36,27 @@ class PatchGrid:
     stride: int = 1
 
     def keypoints(self, cell: int = 16) -> NDArray[np.int64]:
-        """(rows * cols, 2) pixel centres (x, y) in the resized image, truncated to whole pixels."""
-        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
-        offset = cell * self.size // 2 - 1
-        return np.stack([cell * self.stride * col + offset, cell * self.stride * row + offset], axis=1)
+        """(rows * cols, 2) pixel centres (x, y) in the resized image, truncated to whole pixels. Read-only."""
+        return _keypoints(self.size, self.rows, self.cols, self.stride, cell)
 
     def indices(self) -> NDArray[np.int64]:
-        """(rows * cols, 2) grid coordinates (col, row)."""
-        row, col = np.divmod(np.arange(self.rows * self.cols), self.cols)
-        return np.stack([col, row], axis=1)
+        """(rows * cols, 2) grid coordinates (col, row). Read-only."""
+        return _indices(self.rows, self.cols)
+
+
+@lru_cache(maxsize=64)  # asked for at every match of every candidate; a program knows few grids
+def _indices(rows: int, cols: int) -> NDArray[np.int64]:
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    indices = np.stack([col, row], axis=1)
+    indices.flags.writeable = False
+    return indices
+
+
+@lru_cache(maxsize=64)
+def _keypoints(size: int, rows: int, cols: int, stride: int, cell: int) -> NDArray[np.int64]:
+    keypoints = cell * stride * _indices(rows, cols) + (cell * size // 2 - 1)
+    keypoints.flags.writeable = False
+    return keypoints
 
 
 @dataclass(frozen=True, eq=False)
