@@ -2,7 +2,7 @@
 
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from threading import Lock
 from typing import Any
@@ -92,10 +92,12 @@ class Markers:
         with self._lock:
             self._closures.clear()
 
-    def publish(self, refs: Sequence[ImageRef], config: NodeConfig) -> None:
+    def publish(self, refs_of: Callable[[], list[ImageRef]], config: NodeConfig) -> None:
+        """Draw the keyframes that `refs_of` gives, if somebody looks and anything has changed."""
         if not config.publish_markers or not self._publisher.get_subscription_count():
             self._drawn = None
             return
+        refs = refs_of()
         placed = self.track.place(refs) if self._posed else timeline(refs)
         with self._lock:
             closures = list(self._closures)

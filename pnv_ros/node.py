@@ -269,7 +269,7 @@ class PlaceRecognizerNode(LifecycleNode):
         inputs.follow_types()
         inputs.report_mismatches()
         diagnostics.look(self.settings, inputs)
-        recognition.outputs.markers.publish(recognition.recognizer.database.refs(), self.settings.node)
+        recognition.outputs.markers.publish(recognition.recognizer.database.refs, self.settings.node)
 
     def _stop(self) -> None:
         if self._inputs is not None:

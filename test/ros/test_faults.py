@@ -131,7 +131,7 @@ def test_a_publisher_that_dies_and_comes_back_is_heard_again(listener, tmp_path)
         assert node.end() == 0
 
 
-def test_a_clock_that_jumps_is_survived_and_reset_starts_time_anew(listener):
+def test_a_clock_that_jumps_is_survived_reset_starts_time_anew_and_sizes_may_change(listener):
     health = Health(listener)
     with running_node(**EAGER) as node:
         camera = Camera(listener, health, "camera/image_raw")
@@ -143,6 +143,9 @@ def test_a_clock_that_jumps_is_survived_and_reset_starts_time_anew(listener):
         assert trigger(listener, "reset").message == "forgot 2 keyframes"
         camera.send(image(scene(1), at(2)))
         assert health.count("keyframes") == 1
+        camera.send(image(scene(2, 160, 120), at(4)))  # another camera on the same topic
+        node.wait_for("images of camera/image_raw changed from 320x240 to 160x120")
+        assert health.count("keyframes") == 2
         assert node.end() == 0
 
 
