@@ -17,7 +17,7 @@ from pnv_core.types import Evidence, Frame
 # Is it the same place? None where that is not known. Arguments: name and stamp [ns] of query and match.
 Truth = Callable[[str, int, str, int], bool | None]
 
-_SURE_REVISIT = 24  # local inliers, three times what chance gives: an unlabelled loop rather than a look-alike
+SURE_REVISIT = 24  # local inliers, three times what chance gives: an unlabelled loop rather than a look-alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ def truth_of_time(near_s: float, far_s: float) -> Truth:
 def without_unlabelled_loops(examples: Examples) -> Examples:
     """Less the false ones that local features agree on: with truth from time alone they are revisits."""
     keep = np.array(
-        [t or e.local_inliers < _SURE_REVISIT for e, t in zip(examples.evidence, examples.true, strict=True)]
+        [t or e.local_inliers < SURE_REVISIT for e, t in zip(examples.evidence, examples.true, strict=True)]
     )
     return Examples([e for e, k in zip(examples.evidence, keep, strict=True) if k], examples.true[keep])
 

@@ -107,11 +107,11 @@ class Calibration:
             raise ModelError(f"calibration is incomplete or malformed ({error!r}); refit: pnv calibrate") from None
 
 
-# For models without a calibration of their own. The patch part hardly ever passes 0.5: patch scores of an unknown model
-# have an unknown scale. Local features are the same whatever the model: fitted on the sets of the shipped calibration.
+# For models without a calibration of their own. The patch part never passes 0.5: patch scores of an unknown model have
+# an unknown scale. Local features are the same whatever the model: at a spatial score of 0.2, 20 of them are worth 0.5.
 CONSERVATIVE = Calibration(
-    Logistic(-3.0, {"spatial": 1.0, "regularity": 1.0}),
-    Logistic(-3.0, {"spatial": 1.0, "regularity": 1.0, "local_inliers": 8.0}),
+    Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0}),
+    Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0, "local_inliers": 6.0}),
     source="no calibration of this model",
 )
 
