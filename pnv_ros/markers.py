@@ -93,12 +93,17 @@ class Markers:
             self._closures.clear()
 
     def publish(self, refs_of: Callable[[], list[ImageRef]], config: NodeConfig) -> None:
-        """Draw the keyframes that `refs_of` gives, if somebody looks and anything has changed."""
+        """Draw the keyframes that `refs_of` gives, if somebody looks and anything has changed.
+
+        To be called every second where poses place the keyframes, since poses are not kept for long.
+        """
+        placed = self.track.place(refs_of()) if self._posed else None
         if not config.publish_markers or not self._publisher.get_subscription_count():
             self._drawn = None
             return
         refs = refs_of()
-        placed = self.track.place(refs) if self._posed else timeline(refs)
+        if placed is None:
+            placed = timeline(refs)
         with self._lock:
             closures = list(self._closures)
         state = (refs[-1].id if refs else -1, closures[-1][0] if closures else -1, len(placed))
