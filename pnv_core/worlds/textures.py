@@ -233,8 +233,8 @@ def door(rng: Generator, region: Canvas) -> None:
         corners = (left, top), (right, bottom)
         cv2.rectangle(region, *corners, shade(leaf, 0.5), edge // 3 + 1)
     else:
-        for top, bottom in ((0.08, 0.45), (0.55, 0.92)):
-            corners = (int(0.22 * w), int(top * h)), (int(0.78 * w), int(bottom * h))
+        for upper, lower in ((0.08, 0.45), (0.55, 0.92)):
+            corners = (int(0.22 * w), int(upper * h)), (int(0.78 * w), int(lower * h))
             cv2.rectangle(region, *corners, shade(leaf, 0.7), max(1, w // 50))
     side = 0.82 if rng.random() < 0.5 else 0.18
     handle = (int(side * w), int(0.52 * h))
