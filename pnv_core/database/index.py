@@ -12,7 +12,7 @@ from typing import Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core.database.vectors import VectorTable
+from pnv_core.database.vectors import Allowed, VectorTable
 from pnv_core.errors import ConfigError
 
 EXACT_BYTES = 64_000_000  # above this much to read per query, `auto` scans codes: 2.5 ms here, about 10 ms at 6 GB/s
@@ -32,8 +32,8 @@ class VectorIndex(Protocol):
 
     def remove(self, slot: int) -> None: ...
 
-    def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """At least min(k, allowed.sum()) rows, all of them allowed (high,)."""
+    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
+        """At least k rows, or all allowed ones if those are fewer; only allowed ones."""
         ...
 
 
@@ -52,9 +52,9 @@ class ExactIndex:
     def remove(self, slot: int) -> None:
         pass
 
-    def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
-        similarity = _similarities(self._table.vectors[: len(allowed)], query)
-        return _largest(np.where(allowed, similarity, -np.inf), k)
+    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
+        similarity = _similarities(self._table.vectors[: self._table.high], query)
+        return _largest(np.where(allowed.all(), similarity, -np.inf), k)
 
 
 class PqScanIndex:
@@ -123,17 +123,17 @@ class PqScanIndex:
     def remove(self, slot: int) -> None:
         pass  # `allowed` leaves it out until the row is reused
 
-    def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
         examined = max(1000, 20 * k)
         turned = self._turned(query[None])
-        while 4 * examined < len(allowed):
+        while 4 * examined < self._table.high:
             found = self._codes.search(turned, examined)[1][0]
-            found = found[(found >= 0) & (found < len(allowed))]
-            found = found[allowed[found]]
+            found = found[found >= 0]
+            found = found[allowed.of(found)]
             if len(found) >= max(k, examined // 4):
                 return _best(self._table, np.sort(found), query, k)
             examined *= 4
-        return _best(self._table, np.flatnonzero(allowed), query, k)
+        return _best(self._table, np.flatnonzero(allowed.all()), query, k)
 
 
 class FaissIndex:
@@ -146,6 +146,7 @@ class FaissIndex:
         self._row_bytes = row_bytes
         self._built: Any = None
         self._slots = np.zeros(1024, np.int64)  # (rows of the FAISS index or more,) table row of each
+        self._alive = np.zeros(1024, np.bool_)  # (as many,) False once removed
         self._place: dict[int, int] = {}  # table row -> row of the FAISS index
         self._trained_on = 0
 
@@ -171,6 +172,7 @@ class FaissIndex:
         slots = np.sort(np.fromiter(self._place, np.int64))
         self._built = self._build(len(slots), self._table.vectors[slots])
         self._trained_on = len(slots)
+        self._alive[:] = False
         self._append(slots)
 
     def _append(self, slots: NDArray[np.int64]) -> None:
@@ -178,25 +180,27 @@ class FaissIndex:
         self._built.add(self._table.vectors[slots])
         if self._rows > len(self._slots):
             self._slots = np.concatenate([self._slots, np.zeros(self._rows, np.int64)])
-        self._slots[first : self._rows] = slots
+            self._alive = np.concatenate([self._alive, np.zeros(self._rows, np.bool_)])
+        self._slots[first : self._rows], self._alive[first : self._rows] = slots, True
         self._place.update(zip(slots.tolist(), range(first, self._rows), strict=True))
 
     def remove(self, slot: int) -> None:
-        del self._place[slot]
+        place = self._place.pop(slot)
+        if place >= 0:
+            self._alive[place] = False
 
-    def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
         faiss = _faiss()
-        rows = np.flatnonzero(allowed)
+        rows = np.flatnonzero(allowed.all())
         if self._built is None or len(rows) <= max(1000, 20 * k):
             return _best(self._table, rows, query, k)
-        mask = np.zeros(self._rows, np.bool_)
-        mask[np.fromiter((self._place[s] for s in rows.tolist()), np.int64, len(rows))] = True
+        mask = self._alive[: self._rows] & allowed.of(self._slots[: self._rows])
         bits = np.packbits(mask, bitorder="little")
         selector = faiss.IDSelectorBitmap(bits)
         if hasattr(self._built, "hnsw"):
             parameters = faiss.SearchParametersHNSW(efSearch=max(1000, 20 * k), sel=selector)
         else:
-            parameters = faiss.SearchParametersIVF(nprobe=max(16, self._built.nlist // 2), sel=selector)
+            parameters = faiss.SearchParametersIVF(nprobe=max(16, 9 * self._built.nlist // 10), sel=selector)
         found = self._built.search(query[None], max(1000, 20 * k), params=parameters)[1][0]
         found = found[found >= 0]
         if len(found) < k:
@@ -233,7 +237,7 @@ class AutoIndex:
     def remove(self, slot: int) -> None:
         pass
 
-    def search(self, query: NDArray[np.float32], k: int, allowed: NDArray[np.bool_]) -> NDArray[np.int64]:
+    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
         if self._scan is None or self._scan.rows < self._table.high or self._table.high <= self._exact_rows():
             return self._exact.search(query, k, allowed)
         return self._scan.search(query, k, allowed)

@@ -23,7 +23,7 @@ from pnv_core.database.patch_codes import (
     views,
 )
 from pnv_core.database.patch_file import DiskBuffer, PatchFile
-from pnv_core.database.vectors import Row, VectorTable
+from pnv_core.database.vectors import Allowed, Row, VectorTable
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.types import ImageRef, PlaceDescriptor
 
@@ -318,7 +318,7 @@ class KeyframeDatabase:
         """
         query = _unit_vector(vector, self.dim)
         number = None if camera is None else self._cameras.get(camera, -1)
-        allowed = self._table.allowed(self._session, stamp_ns - exclude_recent_ns, number)
+        allowed = Allowed(self._table, self._session, stamp_ns - exclude_recent_ns, number)
         slots = self._index.search(query, k, allowed)
         # once more, row by row: equal vectors then have equal similarities wherever they lie, and ids break the tie
         similarity = np.clip((self._table.vectors[slots] * query).sum(axis=1), -1.0, 1.0)

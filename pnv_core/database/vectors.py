@@ -2,6 +2,7 @@
 
 import mmap
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,11 +86,25 @@ class VectorTable:
     def remove(self, row: Row) -> None:
         self.live[row.slot] = False
 
-    def allowed(self, session: int, before_ns: int, camera: int | None) -> NDArray[np.bool_]:
-        """(high,) rows a query may match: live, of another session or not after `before_ns`, of this camera."""
-        n = self.high
-        mask = (self.sessions[:n] != session) | (self.stamps[:n] <= before_ns)
-        mask &= self.live[:n]
-        if camera is not None:
-            mask &= self.cameras[:n] == camera
+
+@dataclass(frozen=True)
+class Allowed:
+    """Which rows a query may match: live, of another session or not after `before_ns`, of this camera if given."""
+
+    table: VectorTable
+    session: int
+    before_ns: int
+    camera: int | None
+
+    def all(self) -> NDArray[np.bool_]:
+        """(high,) of every row."""
+        return self.of(slice(0, self.table.high))
+
+    def of(self, rows: slice | NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Of these rows; a scan of a million asks for a thousand of them only."""
+        table = self.table
+        mask = (table.sessions[rows] != self.session) | (table.stamps[rows] <= self.before_ns)
+        mask &= table.live[rows]
+        if self.camera is not None:
+            mask &= table.cameras[rows] == self.camera
         return mask
