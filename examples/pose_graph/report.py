@@ -131,7 +131,7 @@ def _summary(ratios: Sequence[float]) -> str:
 
 
 def write_tables(results: Sequence[Result], folder: Path) -> None:
-    """slam.csv with every ratio, and odometry, corrected and true trajectories in TUM format."""
+    """slam.csv with every ratio; per walk the closures, and odometry, corrected and true trajectories in TUM format."""
     with (folder / "slam.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["walk", "closures", "false", "solution", "before_m", "after_m", "ratio"])
@@ -145,11 +145,30 @@ def write_tables(results: Sequence[Result], folder: Path) -> None:
                             [r.walk.name, len(r.recording.closures), tried.false, solution, "", "", f"{ratio:.4f}"]
                         )
     for r in results:
+        _write_closures(r, folder / f"slam_{r.walk.name.replace(' ', '_')}_closures.csv")
         for kind, poses in (("truth", r.walk.truth), ("odometry", r.odometry), ("corrected", r.corrected)):
             quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
             seconds = np.array(r.walk.stamps_ns)[:, None] / 1e9
             table = np.hstack([seconds, poses[:, :3, 3], quaternions])
             np.savetxt(folder / f"slam_{r.walk.name.replace(' ', '_')}_{kind}.tum", table, fmt="%.9f")
+
+
+def _write_closures(result: Result, path: Path) -> None:
+    """How far apart the two images of each closure were truly taken."""
+    nodes = {stamp: node for node, stamp in enumerate(result.walk.stamps_ns)}
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["query_ns", "match_ns", "score", "measured", "apart_m", "turned_deg"])
+        for closure in result.recording.closures:
+            query, match = closure.query, closure.match
+            if query.stamp_ns in nodes and match.stamp_ns in nodes:
+                poses = (result.walk.truth[nodes[ref.stamp_ns]] for ref in (match, query))
+                truly = np.linalg.inv(next(poses)) @ next(poses)
+                turned = np.degrees(np.arccos(np.clip((np.trace(truly[:3, :3]) - 1) / 2, -1, 1)))
+                measured = int((query.stamp_ns, match.id) in result.recording.measured)
+                apart = f"{np.linalg.norm(truly[:3, 3]):.2f}"
+                row = [query.stamp_ns, match.stamp_ns, f"{closure.score:.4f}", measured, apart, f"{turned:.0f}"]
+                writer.writerow(row)
 
 
 def plot(results: Sequence[Result], path: Path) -> None:
