@@ -1,6 +1,7 @@
 """The node as other processes see it: life cycle, inputs, outputs, time, maps."""
 
 import signal
+import sys
 import time
 
 import cv2
@@ -216,6 +217,22 @@ def test_odometry_rules_out_a_closure_and_places_the_keyframes(domain, listener)
         assert [p.x for p in newest.markers[0].points] == [0.0, 10_000.0]
         assert newest.markers[0].header.frame_id == "odom"
         assert node.end() == 0
+
+
+def test_a_worker_that_fails_ends_the_process_with_its_traceback(domain, listener):
+    broken = (
+        "import sys; from pnv_core.recognizer import PlaceRecognizer; "
+        "PlaceRecognizer.process = lambda *_: 1 / 0; "
+        "from pnv_ros.place_recognizer import main; sys.exit(main())"
+    )
+    node = Process(sys.executable, "-c", broken, *ros_arguments(**EAGER))
+    node.wait_for("publishes")
+    health = Health(listener)
+    Camera(listener, health, "camera/image_raw").send(image(scene(1), at(1)), wait=False)
+    assert node.wait() == 1
+    assert "ZeroDivisionError: division by zero" in node.output
+    assert "Traceback" in node.output
+    wait_until(lambda: health.status.level == b"\x02", 10, "the last word on /diagnostics")
 
 
 def test_two_nodes_with_namespaces_do_not_hear_each_other(domain, listener):
