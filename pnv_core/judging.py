@@ -62,13 +62,17 @@ class Judge:
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), number))
         found.sort(key=lambda pair: _rank(pair[0]))
+        if descriptor.thumbnail and config.verify:
+            pictures = [(candidates[i][2].thumbnail, closure.match.camera) for closure, i in found[: config.verify]]
+            shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
+            self.verifier.look_at(shown, self.reranker.workers)
         for place, (closure, number) in enumerate(found[: config.verify]):
             picture = candidates[number][2].thumbnail
             if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
                 seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
                 found[place] = (
-                    self._closure(query, closure.match, seen, results[number], config.min_texture),
+                    self._closure(query, closure.match, seen, scored[number], config.min_texture),
                     number,
                 )
         closures = [closure for closure, _ in found]

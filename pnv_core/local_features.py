@@ -4,11 +4,14 @@ N = features of an image, M = matches.
 """
 
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from pnv_core.parallel import Workers
 
 WIDTH = 320  # pixels; at this width a thumbnail takes about a tenth of a keyframe's patches
 _QUALITY = 85
@@ -120,6 +123,12 @@ class Verifier:
         """The robot's own body as `camera` sees it now; it holds for the camera's older pictures as well."""
         if valid is not None:
             self._valid[camera] = valid
+
+    def look_at(self, pictures: Iterable[tuple[bytes, str]], workers: Workers) -> None:
+        """Find the features of pictures (thumbnail, camera) that are about to be checked, in threads."""
+        new = {picture: camera for picture, camera in pictures if picture not in self._features}
+        found = workers.map(lambda item: detect(item[0], self._valid.get(item[1])), new.items())
+        self._features.update(zip(new, found, strict=True))
 
     def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
         """Two thumbnails and the cameras that took them."""
