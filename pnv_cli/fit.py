@@ -1,4 +1,4 @@
-"""`pnv fit`: vocabulary and projections from one's own images, without training."""
+"""`pnv fit`: a model adapted to one's own images, without training."""
 
 import argparse
 import random
@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from pnv_cli.common import writable
 from pnv_core.errors import ConfigError
-from pnv_core.fit import FitOptions, fit_model, image_files
+from pnv_core.fit import FitOptions, adapt_model, fit_model, image_files
 from pnv_core.model_files import Model, ModelInfo, load_model, make_trunk, save_model
 from pnv_core.weights import resolve_weights
 
@@ -26,6 +26,11 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--weights", default="default", help="model whose trunk is kept: 'default' or a model file")
     parser.add_argument(
         "--trunk", choices=_UNTRAINED, help="a trunk without trained weights instead of that of --weights"
+    )
+    parser.add_argument(
+        "--anew",
+        action="store_true",
+        help="a new vocabulary and PCA instead of adapting the model's; what its training learned there is lost",
     )
     parser.add_argument("--clusters", type=int, help="K; default: the model's, or 16")
     parser.add_argument("--global-dim", type=int, help="D of the global vector; default: the model's, or 512")
@@ -57,16 +62,21 @@ def run(args: argparse.Namespace) -> int:
     if len(files) > args.most:
         files = sorted(random.Random(args.seed).sample(files, args.most))
     base = None if args.trunk else load_model(resolve_weights(args.weights))
-    options = _options(args, base)
-    trunk = (make_trunk(args.trunk, {}) if base is None else base.trunk).to(args.device)
-    info = ModelInfo(args.trunk) if base is None else base.info
-    provenance = (
-        f"vocabulary and projections fitted to {len(files)} images by pnv fit; trunk: {info.provenance or info.trunk}"
-    )
-    model = fit_model(trunk, info, files, options, _bar).with_info(provenance=provenance, calibration=None)
+    anew = bool(base is None or args.anew or args.clusters or args.global_dim or args.patch_dim or args.no_whiten)
+    if anew:
+        trunk = (make_trunk(args.trunk, {}) if base is None else base.trunk).to(args.device)
+        info = ModelInfo(args.trunk) if base is None else base.info
+        model = fit_model(trunk, info, files, _options(args, base), _bar)
+    else:
+        assert base is not None
+        base.trunk.to(args.device)
+        model = adapt_model(base, files, _bar)
+    what = "vocabulary and projections fitted" if anew else "global projection adapted"
+    source = (args.trunk if base is None else base.info.provenance or base.info.trunk).strip()
+    model = model.with_info(provenance=f"{what} to {len(files)} images by pnv fit; before: {source}", calibration=None)
     save_model(model, output)
     print(
-        f"{output}: K = {options.clusters}, D = {model.global_dim}, patches D = {model.patch_dim}, "
+        f"{output}: {what}; K = {model.netvlad.clusters}, D = {model.global_dim}, patches D = {model.patch_dim}, "
         f"{output.stat().st_size / 1e6:.1f} MB"
     )
     if all(measured):

@@ -21,6 +21,8 @@ from pnv_core.patches import patch_vlads
 from pnv_core.trunks import CELL, Trunk
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".ppm", ".tif", ".tiff")
+SHRINKAGE = 0.9  # of the whitening that adapts a trained projection; less of it forgets what training learned
+SAMPLES_PER_DIMENSION = 4  # images a whitened principal direction is estimated from; with fewer it is mostly noise
 Progress = Callable[[Iterable[Path], str], Iterable[Path]]
 
 
@@ -172,8 +174,9 @@ def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions
             vlads = patch_vlads(x[0], weights[0], netvlad.centroids, shape, size)
             count = max(1, options.patches_per_image // len(options.patch_sizes))
             parts.append(vlads[torch.randperm(len(vlads), generator=generator)[:count]])
+    most = len(whole) // SAMPLES_PER_DIMENSION if options.whiten else len(whole) - 1
     return (
-        _projection(*pca(torch.stack(whole), min(options.global_dim, len(whole) - 1), options.whiten)),
+        _projection(*pca(torch.stack(whole), max(1, min(options.global_dim, most)), options.whiten)),
         _projection(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
     )
 
@@ -185,10 +188,41 @@ def fit_vocabulary(
     return vocabulary_of((features_of(trunk, file, options) for file in progress(files, "vocabulary")), options)
 
 
+@torch.no_grad()
+def adapted_projection(projection: Projection, vlads: Tensor, shrinkage: float = SHRINKAGE) -> Projection:
+    """A trained projection centred and gently whitened on the images' VLADs (M, K * C); D stays.
+
+    The covariance of what it gives is shrunk towards a multiple of the identity before its inverse root is taken.
+    """
+    projected = F.linear(vlads, projection.weight, projection.bias)
+    mean = projected.mean(0)
+    covariance = torch.cov(projected.T.double())
+    level = covariance.trace() / len(covariance)
+    shrunk = (1 - shrinkage) * covariance + shrinkage * level * torch.eye(len(covariance), dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(shrunk / level)
+    whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
+    return _projection(whitening @ projection.weight, whitening @ (projection.bias - mean))
+
+
+@torch.no_grad()
+def adapt_model(model: Model, files: Sequence[Path], progress: Progress = plain_progress) -> Model:
+    """The model with its global projection adapted to the images; trunk, vocabulary and patches stay as trained.
+
+    Raises ModelError for fewer than eight images.
+    """
+    if len(files) < 8:
+        raise ModelError(f"{len(files)} images are too few to adapt to; allowed: 8 or more")
+    options = FitOptions(image_width=model.info.image_width, image_height=model.info.image_height)
+    model.trunk.eval()
+    vlads = [model.netvlad(features_of(model.trunk, file, options).cpu())[0] for file in progress(files, "projection")]
+    whole = adapted_projection(model.global_projection, torch.stack(vlads))
+    return replace(model, global_projection=whole, patch_projection=model.patches_projection)
+
+
 def fit_model(
     trunk: Trunk, info: ModelInfo, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
 ) -> Model:
-    """A whole model around a ready trunk. `global_dim` falls to the number of images less one where those are few."""
+    """A whole model around a ready trunk. `global_dim` falls to what the number of images can fill."""
     trunk.eval()
     if min(options.image_width, options.image_height) < CELL * max(options.patch_sizes):
         raise ModelError(

@@ -4,9 +4,9 @@ import torch
 import torch.nn.functional as F
 
 from pnv_core.errors import ModelError
-from pnv_core.fit import FitOptions, fit_model, image_files, pca, spherical_kmeans
+from pnv_core.fit import FitOptions, adapted_projection, fit_model, image_files, pca, spherical_kmeans
 from pnv_core.model_files import ModelInfo, load_model, make_trunk, save_model
-from pnv_core.netvlad import alpha_rule
+from pnv_core.netvlad import Projection, alpha_rule
 
 
 def test_kmeans_finds_directions_that_are_there():
@@ -42,7 +42,7 @@ def test_too_few_samples_are_refused_by_number():
 def test_a_rootsift_model_is_fitted_saved_and_loaded(picture_folder, tmp_path):
     options = FitOptions(
         clusters=4,
-        global_dim=8,
+        global_dim=3,
         patch_dim=6,
         image_width=128,
         image_height=96,
@@ -52,5 +52,17 @@ def test_a_rootsift_model_is_fitted_saved_and_loaded(picture_folder, tmp_path):
     model = fit_model(make_trunk("rootsift", {}), ModelInfo("rootsift"), image_files([picture_folder]), options)
     save_model(model, tmp_path / "m.safetensors")
     again = load_model(tmp_path / "m.safetensors")
-    assert (again.netvlad.clusters, again.global_dim, again.patch_dim) == (4, 8, 6)
+    assert (again.netvlad.clusters, again.global_dim, again.patch_dim) == (4, 3, 6)
     assert again.info.patch_sizes == (2, 3)
+
+
+def test_adapting_without_shrinkage_whitens_and_with_full_shrinkage_only_centres():
+    samples = torch.randn(200, 6, generator=torch.Generator().manual_seed(4)) * torch.tensor([5.0, 3, 1, 1, 1, 1]) + 2
+    identity = Projection(6, 6)
+    identity.load_state_dict({"weight": torch.eye(6), "bias": torch.zeros(6)})
+    white = adapted_projection(identity, samples, shrinkage=0.0)
+    covariance = torch.cov((samples @ white.weight.T + white.bias).T)
+    assert torch.allclose(covariance, covariance[0, 0] * torch.eye(6), atol=1e-2 * covariance[0, 0].item())
+    centred = adapted_projection(identity, samples, shrinkage=1.0)
+    assert torch.allclose(centred.weight, torch.eye(6), atol=1e-5)
+    assert torch.allclose(centred.bias, -samples.mean(0), atol=1e-5)
