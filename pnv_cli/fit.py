@@ -4,6 +4,7 @@ import argparse
 import random
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import torch
 from tqdm import tqdm
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 def _options(args: argparse.Namespace, base: Model | None) -> FitOptions:
     """The base model's sizes unless given."""
     plain = FitOptions(patch_dim=64)
-    given = {
+    given: dict[str, Any] = {
         "clusters": args.clusters or (base.netvlad.clusters if base else plain.clusters),
         "global_dim": args.global_dim or (base.global_dim if base else plain.global_dim),
         "patch_dim": args.patch_dim or (base.patch_dim if base else plain.patch_dim),

@@ -189,7 +189,7 @@ def _validation(held: list[Any]) -> list[Any]:
 
 def _options(kind: Any, given: list[str], **defaults: Any) -> Any:
     """A dataclass of settings from NAME=VALUE. Raises ConfigError for a name or value that is none."""
-    types = {f.name: type(f.default) for f in fields(kind)}
+    types: dict[str, Any] = {f.name: type(f.default) for f in fields(kind)}
     values = dict(defaults)
     for text in given:
         name, equals, value = text.partition("=")
@@ -217,7 +217,7 @@ def _report(journal: Any, folder: Path, output: Path) -> None:
         plot(journal, folder / "training.png")
     except ImportError:
         print(f"no plot: matplotlib is not installed; the figures are in {journal.metrics}")
-    last = next((row for row in reversed(journal.rows()) if any("recall" in name for name in row)), {})
+    last: dict[str, Any] = next((row for row in reversed(journal.rows()) if any("recall" in name for name in row)), {})
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB; metrics and plot in {folder}")
     for name, value in last.items():
         if "recall" in name:

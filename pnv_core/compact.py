@@ -59,15 +59,15 @@ class CompactTrunk(Trunk):
         """(B, 3, H, W) -> what the first `layers` of `features` give."""
         height, width = (side // CELL * CELL for side in images.shape[2:])
         x = self.input(images[:, :, :height, :width])
-        return self.features[:layers](F.pad(x, (0, 1, 0, 1)))  # type: ignore[no-any-return]
+        return self.features[:layers](F.pad(x, (0, 1, 0, 1)))
 
     def back(self, maps: Tensor, layers: int) -> Tensor:
         """The rest after `front` with as many layers: -> (B, C, h, w)."""
-        return self.neck(self.features[layers:](maps))  # type: ignore[no-any-return]
+        return self.neck(self.features[layers:](maps))
 
     def backbone(self, images: Tensor) -> Tensor:
         """(B, 3, H, W) -> (B, width, h, w), before the neck."""
         return self.front(images, len(self.features))
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.neck(self.backbone(images))  # type: ignore[no-any-return]
+        return self.neck(self.backbone(images))

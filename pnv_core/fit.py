@@ -65,7 +65,7 @@ def read_rgb(path: Path, width: int, height: int) -> np.ndarray:
 
 def as_batch(images: Sequence[np.ndarray] | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
     """(H, W, 3) uint8 images -> (B, 3, H, W) float in [0, 1], channels last in memory."""
-    pixels = torch.from_numpy(np.stack(images)).to(device)
+    pixels = torch.from_numpy(np.stack(list(images))).to(device)
     return (pixels.permute(0, 3, 1, 2).float() / 255.0).contiguous(memory_format=torch.channels_last)
 
 
@@ -135,7 +135,7 @@ def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
 def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
     """The feature map (1, C, h, w) of an image file, on the device of the trunk."""
     device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
-    return trunk(as_batch([read_rgb(path, options.image_width, options.image_height)], device)).float()  # type: ignore[no-any-return]
+    return trunk(as_batch([read_rgb(path, options.image_width, options.image_height)], device)).float()
 
 
 @torch.no_grad()

@@ -26,6 +26,10 @@ class RootSIFTTrunk(Trunk):
     """
 
     channels = _ORIENTATIONS * _BINS * _BINS
+    luma: Tensor
+    triangle: Tensor
+    blur: Tensor
+    angles: Tensor
     _BIN = CELL // 2  # pixels
 
     def __init__(self) -> None:

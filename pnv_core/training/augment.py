@@ -118,7 +118,7 @@ def relight(pixels: Pixels, strength: float, rng: Rng, occluder: Pixels | None =
         image = _noisy(image, rng.uniform(3, 16), rng)
     if rng.random() < 0.25 * strength:
         _, coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(15, 60))])
-        image = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        image = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR), np.uint8)
     if rng.random() < 0.2 * strength:
         image = cv2.cvtColor(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     return np.ascontiguousarray(image)
@@ -145,7 +145,9 @@ def _dense(nodes: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.flo
     """Node values (n, m) -> pixel values (H, W): bilinear between nodes that lie on the view's edges."""
     width, height = size
     n, m = nodes.shape[:2]
-    matrix = np.float32([[(m - 1) / width, 0, 0.5 * (m - 1) / width], [0, (n - 1) / height, 0.5 * (n - 1) / height]])
+    matrix = np.array(
+        [[(m - 1) / width, 0, 0.5 * (m - 1) / width], [0, (n - 1) / height, 0.5 * (n - 1) / height]], np.float32
+    )
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return cv2.warpAffine(nodes.astype(np.float32), matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
 

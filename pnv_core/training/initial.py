@@ -26,7 +26,7 @@ def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> CompactTrunk:
         trunk.load_state_dict({name: tensors[name] for name in trunk.state_dict()})
     except (KeyError, TypeError, RuntimeError) as error:
         raise ModelError(f"{weights}: no SqueezeNet 1.1 trunk ({error})") from None
-    return trunk.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload, no-any-return]
+    return trunk.to(memory_format=torch.channels_last).eval()  # type: ignore[call-overload]
 
 
 @torch.no_grad()

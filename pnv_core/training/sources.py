@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from pnv_core.errors import ModelError
 
+Pose = tuple[float, float, float, float]  # x, y, z in metres, yaw in radians
+
 LONGER_SIDE = 400  # pixels kept of a training image; views are smaller
 PANORAMA_WIDTH = 1280
 
@@ -77,7 +79,7 @@ class PlaceImage:
     index: int
     rgb: NDArray[np.uint8]
     panorama: bool = False
-    pose: tuple[float, float, float, float] | None = None  # x, y, z in metres, yaw in radians
+    pose: Pose | None = None
 
 
 def is_held(image: PlaceImage) -> bool:
@@ -91,6 +93,7 @@ def load_set(folder: Path | str) -> list[PlaceImage]:
     """The images of one training folder, thinned as its rule says. Raises ModelError for a folder without images."""
     folder = Path(folder)
     rule = RULES.get(folder.name, DEFAULT_RULE)
+    rows: list[tuple[str, str, int, Pose | None]]
     if (folder / "groups.csv").is_file():
         rows = [
             (r["image"], r["place_or_sequence_id"], int(r["index_in_sequence"]), None)

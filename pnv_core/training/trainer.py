@@ -83,7 +83,7 @@ class Trainer:
                 "parts": model.patch_projection,
             }
         ).to(self.device)
-        self.parts["trunk"].to(memory_format=torch.channels_last)
+        self.parts["trunk"].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._freeze()
         self.start = {n: p.detach().clone() for n, p in self.parts.named_parameters()}
         self.average = {n: p.detach().clone() for n, p in self.parts.named_parameters()}
@@ -122,7 +122,7 @@ class Trainer:
     def _freeze(self) -> None:
         for parameter in self.parts.parameters():
             parameter.requires_grad_(True)
-        for layer in list(self.model.trunk.features)[: self.options.frozen_layers]:  # type: ignore[union-attr, arg-type]
+        for layer in list(getattr(self.model.trunk, "features", []))[: self.options.frozen_layers]:
             layer.requires_grad_(False)
 
     def _groups(self) -> list[dict[str, Any]]:
@@ -181,9 +181,9 @@ class Trainer:
         """Feature maps of images, or of what the frozen layers gave for them."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.options.mixed):
             if inputs.dtype == torch.uint8:
-                return self.model.trunk((inputs.float() / 255).contiguous(memory_format=torch.channels_last))  # type: ignore[no-any-return]
+                return self.model.trunk((inputs.float() / 255).contiguous(memory_format=torch.channels_last))
             maps = inputs.float().contiguous(memory_format=torch.channels_last)
-            return self.model.trunk.back(maps, self.options.frozen_layers)  # type: ignore[operator, no-any-return]
+            return self.model.trunk.back(maps, self.options.frozen_layers)  # type: ignore[operator]
 
     def _patch_loss(self, batch: Batch, x: Tensor, weights: Tensor, shape: tuple[int, int]) -> Tensor:
         """Mean over some image pairs of one scene, at one patch size."""

@@ -21,7 +21,7 @@ from pnv_core.training.journal import Journal
 from pnv_core.training.losses import TRIPLET_MARGIN, triplet_ranking
 from pnv_core.training.sources import PlaceImage, relation
 from pnv_core.training.validation import ValidationSet, recalls
-from pnv_core.trunks import Trunk, VGG16Trunk
+from pnv_core.trunks import Trunk
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,9 @@ class TripletTrainer:
             raise ModelError(f"{len(self.images)} images cannot make tuples; allowed: more than {options.negatives}")
         self.validation, self.options, self.device = validation, options, torch.device(device)
         self.parts = nn.ModuleDict({"trunk": trunk, "netvlad": netvlad}).to(self.device)
-        self.parts["trunk"].to(memory_format=torch.channels_last)
+        self.parts["trunk"].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.parts.requires_grad_(True)
-        layers = list(trunk.features) if isinstance(trunk, VGG16Trunk) or hasattr(trunk, "features") else []
+        layers: list[nn.Module] = list(getattr(trunk, "features", []))
         for layer in layers[: options.first_layer]:
             layer.requires_grad_(False)
         trained = [p for p in self.parts.parameters() if p.requires_grad]
@@ -167,7 +167,7 @@ class TripletTrainer:
     def _vlads(self, pixels: Sequence[np.ndarray]) -> Tensor:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.options.mixed):
             features = self.parts["trunk"](as_batch(pixels, self.device))
-        return self.parts["netvlad"](features.float())  # type: ignore[no-any-return]
+        return self.parts["netvlad"](features.float())
 
     @torch.no_grad()
     def _validate(self) -> dict[str, float]:

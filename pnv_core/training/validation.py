@@ -66,11 +66,11 @@ def sequence_queries(
     table = np.array([[relation(q, r) for r in references] for q in rest])
     usable = np.flatnonzero((table > 0).any(1) & (table < 0).any(1))
     usable = np.sort(rng.permutation(usable)[:most])
-    plain = [
+    plain: list[NDArray[np.uint8]] = [
         np.stack([flat_view(i.rgb, size, 0.0, False, rng).pixels for i in chosen])
         for chosen in ([rest[u] for u in usable], references)
     ]
-    return ValidationSet(name, *plain, table[usable] > 0, table[usable] != 0)
+    return ValidationSet(name, plain[0], plain[1], table[usable] > 0, table[usable] != 0)
 
 
 def recalls(
