@@ -214,7 +214,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "pnv_closures")
     parser.add_argument("--write", action="store_true", help="write the calibration into the model file")
     parser.add_argument("--plot", type=Path, help="reliability diagram")
-    args = parser.parse_args(argv)
+    args = parser.parse_intermixed_args(argv)
     describer = describer_from(Config.make(weights=args.weights))
     if args.what == "fit":
         calibration = fit(args.shared, describer, args.cache, tuple(args.names) or FIT)
