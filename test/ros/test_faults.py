@@ -175,7 +175,7 @@ def test_a_subscriber_that_never_reads_does_not_hold_the_node_up(listener, tmp_p
             "--stamps", noise_stamps(tmp_path / "stamps.csv", count, 10**9), "--rate", "10", "--reliable"
         )
         assert camera.wait() == 0
-        wait_until(lambda: health.count("frames processed") > count // 3, 30, "frames in spite of the sleeper")
+        wait_until(lambda: health.count("frames processed") > count // 10, 60, "frames in spite of the sleeper")
         assert health.count("closures") > 0
         assert node.end() == 0
     wake.set()
