@@ -12,6 +12,7 @@ REQUIRED = [
     "torch>=2.4",  # torch.load(weights_only=True) with an allow list, used for published checkpoints
     "faiss-cpu>=1.8",
     "safetensors>=0.4",
+    "pillow>=10",  # resizes as the reference does
     "scipy>=1.11",
     "numba>=0.60",  # compiled inner loops; the code runs without it, slower
     "threadpoolctl>=3",
@@ -57,7 +58,7 @@ setup(
     maintainer="pnv_ros contributors",
     maintainer_email="pnv_ros@users.noreply.github.com",
     license="MIT",
-    python_requires=">=3.10",
+    python_requires=">=3.11",
     packages=find_packages(include=["pnv_core*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
     package_data={"pnv_core": ["models/*"], "pnv_cli": ["*.html"]},
     data_files=[
@@ -67,7 +68,7 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*")),
     ],
     install_requires=REQUIRED,
-    extras_require={"ros": ROS, "dev": DEVELOPMENT, "slam": SLAM},
+    extras_require={"ros": ROS, "dev": DEVELOPMENT, "slam": SLAM, "dask": DASK},
     entry_points={
         "console_scripts": [
             "place_recognizer = pnv_ros.place_recognizer:main",

@@ -87,7 +87,7 @@ def fill_map(path: Path, keyframes: int, images: list[NDArray[np.uint8]]) -> Non
         vector = descriptor.global_vector + rng.normal(0, 0.01, len(descriptor.global_vector)).astype(np.float32)
         turned = replace(descriptor, global_vector=(vector / np.linalg.norm(vector)).astype(np.float32))
         database.add(10**9 * number, "0", turned)
-    MapStore(path, describer.fingerprint).save(database.snapshot())
+    MapStore(path, describer.map_fingerprint).save(database.snapshot())
 
 
 def summary(latency_ms: NDArray[np.float64], processed: int, seconds: float) -> dict[str, Any]:

@@ -8,11 +8,13 @@ import cv2
 from pnv_cli.common import add_config_flags, config_from, writable
 from pnv_core.describer import describer_from
 from pnv_core.drawing import draw_match
-from pnv_core.errors import PnvError
+from pnv_core.errors import ConfigError
 from pnv_core.files import atomic_write
 from pnv_core.images import read_image
 from pnv_core.reranker import Reranker
 from pnv_core.spatial import ransac_score, rapid_spatial_score
+
+PICTURES = (".png", ".jpg", ".jpeg")
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
@@ -27,6 +29,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
 
 def run(args: argparse.Namespace) -> int:
     picture = writable(args.draw) if args.draw else None
+    if picture and picture.suffix.lower() not in PICTURES:
+        raise ConfigError(f"--draw {picture}: is no picture; allowed: {', '.join(PICTURES)}")
     describer = describer_from(config_from(args))
     images = [read_image(path) for path in (args.query, args.reference)]
     query, reference = (describer.describe(image) for image in images)
@@ -49,9 +53,7 @@ def run(args: argparse.Namespace) -> int:
     if picture:
         caption = f"score {result.score:.3f}  similarity {similarity:.3f}"
         image = draw_match(*images, result.matches, describer.image_size, caption)
-        ok, encoded = cv2.imencode(picture.suffix or ".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if not ok:
-            raise PnvError(f"{picture}: cannot be written as {picture.suffix!r}; allowed: .png, .jpg")
+        _, encoded = cv2.imencode(picture.suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         with atomic_write(picture) as file:
             file.write(encoded.tobytes())
     print(json.dumps(report) if args.json else _table(report))

@@ -36,6 +36,8 @@ COLUMNS = (
     "reason",
 )
 
+Names = dict[tuple[str, int], str]  # of a frame, by camera and stamp
+
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser("run", help="loop closures of a sequence", allow_abbrev=False)
@@ -65,14 +67,14 @@ def run(args: argparse.Namespace) -> int:
     timer = StageTimer(time.perf_counter)
     recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
     recorder = _recorder(recognizer) if report else None
-    names: dict[int, str] = {}  # by stamp
+    names: Names = {}
     rows: list[dict] = []
     done = 0
     try:
         for name, frame in tqdm(
             source.frames, total=source.count or None, unit="frame", disable=not sys.stderr.isatty()
         ):
-            names[frame.stamp_ns] = name
+            names[frame.camera, frame.stamp_ns] = name
             closures = recognizer.process(frame)
             rows += [_row(c, names) for c in _reported(closures, args.all)]
             if recorder:
@@ -98,10 +100,10 @@ def _recorder(recognizer: PlaceRecognizer) -> "RunRecorder":
     return RunRecorder(recognizer.describer.image_size)
 
 
-def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespace, names: dict[int, str]) -> None:
+def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespace, names: Names) -> None:
     from pnv_core.evaluation.run_report import read_positions
 
-    positions = read_positions(Path(args.poses), list(names)) if args.poses else None
+    positions = read_positions(Path(args.poses), [stamp for _, stamp in names]) if args.poses else None
     taken = Path(args.images or args.video or args.bag).name
     with atomic_write(target) as file:
         file.write(recorder.html([("Input", taken)], positions).encode())
@@ -122,10 +124,10 @@ def _reported(closures: list[LoopClosure], best_of_every_query: bool) -> Iterato
     yield from accepted or (closures[:1] if best_of_every_query else [])
 
 
-def _row(closure: LoopClosure, names: dict[int, str]) -> dict:
+def _row(closure: LoopClosure, names: Names) -> dict:
     return {
-        "query": names[closure.query.stamp_ns],
-        "match": names[closure.match.stamp_ns],
+        "query": names[closure.query.camera, closure.query.stamp_ns],
+        "match": names[closure.match.camera, closure.match.stamp_ns],
         "query_stamp": _seconds(closure.query.stamp_ns),
         "match_stamp": _seconds(closure.match.stamp_ns),
         "score": f"{closure.score:.6f}",

@@ -1,6 +1,5 @@
 """Where frames come from: a folder of images, a video, a rosbag2. Each gives (name, Frame) in order."""
 
-import csv
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -11,6 +10,7 @@ import cv2
 
 from msg_adapters.images import message_to_frame
 from pnv_core.errors import ImageError, PnvError
+from pnv_core.evaluation.datasets.tables import rows
 from pnv_core.images import list_images, read_image
 from pnv_core.types import Frame
 
@@ -47,18 +47,12 @@ def image_folder(folder: str, fps: float, timestamps: str | None) -> FrameSource
 def _read_timestamps(path: str, names: list[str]) -> list[int]:
     """Nanoseconds per image name; they must grow. Raises PnvError naming the first row that is wrong."""
     stamps: dict[str, int] = {}
-    with open(path, newline="") as file:
-        rows = csv.DictReader(file)
-        if not {"frame", "timestamp"} <= set(rows.fieldnames or ()):
-            raise PnvError(f"{path}: has the columns {rows.fieldnames}; allowed: frame, timestamp")
-        for row in rows:
-            try:
-                seconds, _, fraction = row["timestamp"].strip().partition(".")
-                stamps[row["frame"].strip()] = int(seconds) * 10**9 + int((fraction + "0" * 9)[:9])
-            except (ValueError, AttributeError):
-                raise PnvError(
-                    f"{path} line {rows.line_num}: timestamp {row['timestamp']!r}; allowed: seconds"
-                ) from None
+    for line, row in enumerate(rows(Path(path), ("frame", "timestamp")), start=2):
+        try:
+            seconds, _, fraction = row["timestamp"].strip().partition(".")
+            stamps[row["frame"].strip()] = int(seconds) * 10**9 + int((fraction + "0" * 9)[:9])
+        except (ValueError, AttributeError):
+            raise PnvError(f"{path} line {line}: timestamp {row['timestamp']!r}; allowed: seconds") from None
     by_stem = {Path(name).stem: stamp for name, stamp in stamps.items()}
     found = [stamps.get(name, by_stem.get(Path(name).stem)) for name in names]
     if None in found:

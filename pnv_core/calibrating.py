@@ -1,6 +1,5 @@
 """Calibration on a user's own sequence: run the recogniser, tell true candidates from false ones, fit."""
 
-import csv
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 from pnv_core.calibration import Calibration, Reliability, fit_calibration, reliability, threshold_for_precision
 from pnv_core.describer import Describer
 from pnv_core.errors import PnvError
+from pnv_core.evaluation.datasets.tables import rows
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Evidence, Frame
 
@@ -31,15 +31,15 @@ class Examples:
 def gathered(describer: Describer, frames: Iterable[tuple[str, Frame]], truth: Truth, recent_s: float) -> Examples:
     """Every candidate of a sequence whose truth is known. `recent_s` is the exclusion window while gathering."""
     config = describer.config
-    config = config.replace(exclude_recent_s=recent_s, consistency=0, verify=config.candidates)
+    config = config.replace(exclude_recent_s=recent_s, consistency=0, verify=min(100, config.candidates))
     recognizer = PlaceRecognizer(config, describer)
-    names: dict[int, str] = {}
+    names: dict[tuple[str, int], str] = {}
     evidence, true = [], []
     for name, frame in frames:
-        names[frame.stamp_ns] = name
+        names[frame.camera, frame.stamp_ns] = name
         for closure in recognizer.process(frame):
             query, match = closure.query.stamp_ns, closure.match.stamp_ns
-            label = truth(name, query, names[match], match)
+            label = truth(name, query, names[closure.match.camera, match], match)
             if label is not None and closure.evidence is not None:
                 evidence.append(closure.evidence)
                 true.append(label)
@@ -103,13 +103,13 @@ def without_unlabelled_loops(examples: Examples) -> Examples:
 
 def truth_of_poses(path: Path | str, radius_m: float, heading_deg: float) -> Truth:
     """From a CSV of frame,x,y[,z][,yaw]: within the radius and heading is one place, beyond twice either another."""
-    rows = _rows(path, {"frame", "x", "y"})
+    table = rows(Path(path), ("frame", "x", "y"))
     try:
-        poses = {r["frame"]: [float(r[k]) for k in ("x", "y", "z", "yaw") if k in r] for r in rows}
-    except ValueError as error:
+        poses = {r["frame"]: [float(r[k]) for k in ("x", "y", "z", "yaw") if k in r] for r in table}
+    except (ValueError, TypeError) as error:
         raise PnvError(f"{path}: {error}; allowed: numbers in x, y, z, yaw") from None
-    axes = 3 if "z" in rows[0] else 2
-    turns = "yaw" in rows[0]
+    axes = 3 if table and "z" in table[0] else 2
+    turns = bool(table) and "yaw" in table[0]
 
     def truth(query: str, query_ns: int, match: str, match_ns: int) -> bool | None:
         if query not in poses or match not in poses:
@@ -126,18 +126,9 @@ def truth_of_poses(path: Path | str, radius_m: float, heading_deg: float) -> Tru
 
 def truth_of_matches(path: Path | str) -> Truth:
     """From a CSV of query,true_refs (references separated by `;`): queries not listed are not judged."""
-    true = {r["query"]: set(r["true_refs"].split(";")) for r in _rows(path, {"query", "true_refs"})}
+    true = {r["query"]: set((r["true_refs"] or "").split(";")) for r in rows(Path(path), ("query", "true_refs"))}
 
     def truth(query: str, query_ns: int, match: str, match_ns: int) -> bool | None:
         return match in true[query] if query in true else None
 
     return truth
-
-
-def _rows(path: Path | str, needed: set[str]) -> list[dict[str, str]]:
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    if not rows or not needed <= set(rows[0]):
-        given = ", ".join(rows[0]) if rows else "no rows"
-        raise PnvError(f"{path}: has {given}; allowed: a CSV with the columns {', '.join(sorted(needed))}")
-    return rows

@@ -1,6 +1,7 @@
 """Describer: an image to a PlaceDescriptor. D dimensions, P patch sizes."""
 
 import copy
+import hashlib
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,11 @@ class Describer:
         """(width, height) in pixels that every image is resized to."""
         return self.config.image_width, self.config.image_height
 
+    @property
+    def map_fingerprint(self) -> str:
+        """Of everything that descriptors must share to be compared: the model, the image size and the patch grids."""
+        return hashlib.sha256(f"{self.fingerprint} {self.image_size} {self.grids()}".encode()).hexdigest()
+
     def grids(self) -> list[tuple[int, int, int, int]]:
         """(size, stride, rows, cols) per patch size."""
         h, w = self.config.image_height // CELL, self.config.image_width // CELL
@@ -100,7 +106,7 @@ class Describer:
                 PatchGrid(size, rows, cols, array, stride)
                 for array, (size, stride, rows, cols) in zip(arrays, self.grids(), strict=True)
             )
-            return PlaceDescriptor(vector.cpu().numpy(), patches, texture(pixels))
+            return PlaceDescriptor(vector.cpu().numpy(), patches, texture(pixels, valid))
 
     def _patches(self, x: torch.Tensor, weights: torch.Tensor, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
         sizes, strides = self.config.patch_sizes, self.config.patch_strides
@@ -142,16 +148,20 @@ def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8
     return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR)).copy()
 
 
-def texture(pixels: NDArray[np.uint8]) -> float:
-    """Share of the 16 px cells whose grey values vary by more than sensor noise, in [0, 1]."""
+def texture(pixels: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> float:
+    """Share of the 16 px cells whose grey values vary by more than sensor noise, in [0, 1]; of the valid cells only."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
     h, w = max(grey.shape[0] // CELL, 1), max(grey.shape[1] // CELL, 1)
     mean = cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA)
     square = cv2.resize(grey * grey, (w, h), interpolation=cv2.INTER_AREA)
-    return float(np.mean(square - mean * mean > _FLAT_CELL_STD**2))
+    textured = square - mean * mean > _FLAT_CELL_STD**2
+    if valid is None:
+        return float(textured.mean())
+    seen = _valid_cells(valid, (h, w)).reshape(h, w) > 0.0
+    return float(textured[seen].mean()) if seen.any() else 0.0
 
 
-def _valid_cells(valid: NDArray[np.bool_], shape: torch.Size) -> NDArray[np.float32]:
+def _valid_cells(valid: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.float32]:
     """(H, W) bool -> (1, 1, h * w) share of valid pixels, cells less than half valid cut to 0."""
     share = cv2.resize(valid.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
     return np.where(share < 0.5, 0.0, share).astype(np.float32).reshape(1, 1, -1)

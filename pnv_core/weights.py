@@ -142,7 +142,13 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
                     progress(done, total)
             return total
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing is missing
+        if error.code == 416 and have:  # there is nothing after what is here: whole, or longer than the file
+            size = str(error.headers.get("Content-Range", "")).rpartition("/")[2]
+            if size.isdigit() and int(size) != have:
+                part.unlink()
+                raise ModelError(
+                    f"{url}: {have} bytes are here but the file has {size}; discarded, run the command again"
+                ) from None
             return have
         raise ModelError(f"{url}: the server answered {error.code} {error.reason}") from None
     except (urllib.error.URLError, TimeoutError, ConnectionError) as error:

@@ -183,7 +183,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
         self._others = self._subscribe_others(recognizer, outputs, views, poses)
-        self._map = SavedMap(database, describer.fingerprint)
+        self._map = SavedMap(database, describer.map_fingerprint)
         self._map.path = config.map_path
         if config.load_on_start:
             self.get_logger().info(self.load() if self._map.exists() else f"no map at {config.map_path} yet")

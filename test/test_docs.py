@@ -86,7 +86,7 @@ def given_names() -> dict[str, object]:
     describer = load_describer()
     recognizer = PlaceRecognizer(Config(), describer)
     closures = [c for stamp, rgb in frames for c in recognizer.process(Frame(stamp, "/camera/image_raw", rgb))]
-    MapStore("office.map", describer.fingerprint).save(recognizer.database.snapshot())
+    MapStore("office.map", describer.map_fingerprint).save(recognizer.database.snapshot())
     camera = {"fx": 300.0, "fy": 300.0, "cx": 80.0, "cy": 60.0, "width": 160}
     publisher = SimpleNamespace(publish=lambda message: None)
     return {

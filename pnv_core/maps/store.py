@@ -78,7 +78,7 @@ class MapStore:
         if manifest.fingerprint != self.fingerprint:
             raise MapError(
                 f"{self.path} was made with model {manifest.fingerprint}; this is model {self.fingerprint}; "
-                "allowed: a map of the same model"
+                "allowed: a map of the same model, image size and patch sizes"
             )
         if manifest.dim != database.dim:
             raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")

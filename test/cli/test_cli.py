@@ -254,8 +254,12 @@ def test_paths_that_cannot_be_written_or_read_are_refused_before_any_work(model,
     for row, message in {"004.png,3.5": "not later than", "004.png,soon": "line 6: timestamp 'soon'"}.items():
         stamps.write_text("\n".join(["frame,timestamp", *rows[:4], row, *rows[5:]]))
         assert message in refused(capsys, *run, tmp_path / "c.csv", "--timestamps", stamps)
+    stamps.write_bytes(b"\xff\xfe\x00frame,timestamp")
+    assert "is no csv text" in refused(capsys, *run, tmp_path / "c.csv", "--timestamps", stamps)
+    pair = [images / "000.png", images / "001.png"]
+    assert "is no picture; allowed: .png" in refused(capsys, "match", *pair, "--draw", tmp_path / "m.xyz")
     stamps.write_text("a,b\n1,2\n")
-    assert "allowed: frame, timestamp" in refused(capsys, *run, tmp_path / "c.csv", "--timestamps", stamps)
+    assert "lacks the column frame, timestamp" in refused(capsys, *run, tmp_path / "c.csv", "--timestamps", stamps)
 
 
 def test_a_wrong_model_file_is_refused_in_one_line(images, tmp_path, capsys):

@@ -161,7 +161,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.server.ranges.append(wanted)
         start = int(wanted.removeprefix("bytes=").rstrip("-")) if wanted else 0
         if start >= len(self.server.content):
-            self.send_error(416)
+            self.send_response(416)
+            self.send_header("Content-Range", f"bytes */{len(self.server.content)}")
+            self.end_headers()
             return
         body = self.server.content[start:]
         self.send_response(206 if wanted else 200)
@@ -206,6 +208,15 @@ def test_an_interrupted_download_resumes_where_it_stopped(server):
     path = published.fetch("pittsburgh_WPCA512")
     assert path.read_bytes() == server.content
     assert server.ranges == [None, "bytes=100000-"]
+
+
+def test_a_stale_part_longer_than_the_file_is_discarded(server):
+    part = published.PUBLISHED["mapillary_WPCA512"].path.with_name("mapillary_WPCA512.pth.tar.part")
+    part.parent.mkdir(parents=True)
+    part.write_bytes(server.content + b"more")
+    with pytest.raises(ModelError, match="300004 bytes are here but the file has 300000"):
+        published.fetch("mapillary_WPCA512")
+    assert published.fetch("mapillary_WPCA512").read_bytes() == server.content
 
 
 def test_a_file_that_differs_from_the_recorded_hash_is_discarded(server):

@@ -145,6 +145,17 @@ def test_a_masked_region_does_not_change_the_descriptor():
     assert float(free_a.global_vector @ free_b.global_vector) < 0.99
 
 
+def test_texture_counts_what_the_mask_leaves_only():
+    """A blank wall seen above a textured bonnet is a blank wall."""
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    image[96:] = noise_image(5)[96:]
+    valid = np.ones(image.shape[:2], bool)
+    valid[96:] = False
+    describer = small_describer()
+    assert describer.describe(image).texture > 0.3
+    assert describer.describe(image, valid).texture == 0.0
+
+
 def test_alpha_gives_the_second_cluster_a_hundredth_of_the_first_on_average():
     """NetVLAD appendix: the mean gap of the two largest logits is -ln 0.01."""
     rng = torch.Generator().manual_seed(3)

@@ -11,7 +11,7 @@ def words(path: Path) -> list[tuple[int, list[str]]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise PnvError(f"{path}: missing; the data set is laid out otherwise than its documentation says") from None
+        raise PnvError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise PnvError(f"{path}: cannot be read ({error})") from None
     lines = enumerate(text.splitlines(), 1)
@@ -41,7 +41,7 @@ def rows(path: Path, columns: tuple[str, ...]) -> list[dict[str, str]]:
                 )
             return list(reader)
     except FileNotFoundError:
-        raise PnvError(f"{path}: missing; the data set is laid out otherwise than its documentation says") from None
+        raise PnvError(f"{path}: no such file") from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise PnvError(f"{path}: is no csv text ({error})") from None
 
