@@ -6,16 +6,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from msg_adapters.images import check_size
 from pnv_core.errors import ImageError
 
 PINHOLE = ("plumb_bob", "rational_polynomial")
 FISHEYE = ("equidistant", "fisheye")
+PINHOLE_COEFFICIENTS = 4, 5, 8, 12, 14
+FISHEYE_COEFFICIENTS = 4
 
 
 class Rectifier:
     """Removes lens distortion as a CameraInfo describes it; the maps are computed once.
 
-    Raises ImageError for an uncalibrated camera or a distortion model other than the ones above.
+    Raises ImageError for an uncalibrated camera, a size that no image may have, and a distortion model or a number of
+    coefficients other than the ones above.
     """
 
     def __init__(self, info: Any) -> None:
@@ -24,15 +28,24 @@ class Rectifier:
         if not k[0, 0] > 0 or 0 in self.size:
             raise ImageError(f"camera info of {self.size[0]}x{self.size[1]} has focal length {k[0, 0]:g}; "
                              "allowed: a calibrated camera")  # fmt: skip
+        if not (np.isfinite(k).all() and np.isfinite(d).all()):
+            raise ImageError(f"camera info has k = {k.ravel().tolist()} and d = {d.tolist()}; allowed: finite numbers")
+        check_size(*self.size)
         model = info.distortion_model
         if d.size and model not in PINHOLE + FISHEYE:
             raise ImageError(f"distortion model {model!r} is unknown; allowed: {', '.join(PINHOLE + FISHEYE)}")
+        allowed = (FISHEYE_COEFFICIENTS,) if model in FISHEYE else PINHOLE_COEFFICIENTS
+        if d.any() and d.size not in allowed:
+            raise ImageError(f"distortion model {model!r} comes with {d.size} coefficients; "
+                             f"allowed: 0, {', '.join(map(str, allowed))}")  # fmt: skip
         self.focal_and_centre = k[0, 0], k[1, 1], k[0, 2], k[1, 2]  # pixels, before and after
         self._maps: tuple[Any, Any] | None = None
         if d.any():
             undistort = cv2.fisheye.initUndistortRectifyMap if model in FISHEYE else cv2.initUndistortRectifyMap
-            coefficients = d[:4] if model in FISHEYE else d
-            self._maps = undistort(k, coefficients, np.eye(3), k, self.size, cv2.CV_16SC2)
+            try:
+                self._maps = undistort(k, d, np.eye(3), k, self.size, cv2.CV_16SC2)
+            except cv2.error as error:
+                raise ImageError(f"camera info cannot be used ({error.err}); allowed: a calibrated camera") from error
 
     def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W) or (H, W, 3) -> the same shape, 0 where nothing was seen. Raises ImageError for another size."""

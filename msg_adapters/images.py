@@ -87,7 +87,7 @@ def image_to_rgb(message: Any) -> NDArray[np.uint8]:
     if encoding is None:
         raise ImageError(f"image encoding {message.encoding!r} is unknown; allowed: {', '.join(sorted(ENCODINGS))}")
     height, width, step = int(message.height), int(message.width), int(message.step)
-    _check_size(width, height)
+    check_size(width, height)
     if encoding.even_width and width % 2:
         raise ImageError(f"image of encoding {message.encoding} is {width} wide; allowed: an even width")
     row = width * encoding.channels * np.dtype(encoding.dtype).itemsize
@@ -123,7 +123,7 @@ def compressed_to_rgb(message: Any) -> NDArray[np.uint8]:
             f"compressed image of format {message.format!r} starts with {head[:8].hex(' ') or 'nothing'}; "
             "allowed: jpeg, png"
         )
-    _check_size(*size)
+    check_size(*size)
     try:
         pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -147,7 +147,8 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
     return np.frombuffer(data if isinstance(data, bytes | bytearray | memoryview) else memoryview(data), np.uint8)
 
 
-def _check_size(width: int, height: int) -> None:
+def check_size(width: int, height: int) -> None:
+    """Raises ImageError for a size that is not taken."""
     if not (MIN_SIDE <= width <= MAX_SIDE and MIN_SIDE <= height <= MAX_SIDE and width * height <= MAX_PIXELS):
         raise ImageError(
             f"image is {width}x{height} pixels; allowed: sides of {MIN_SIDE} to {MAX_SIDE}, at most {MAX_PIXELS} pixels"

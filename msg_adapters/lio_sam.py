@@ -1,7 +1,7 @@
 """Closures as LIO-SAM takes them from outside.
 
 LIO-SAM's subscriber keeps messages of exactly two doubles, [newer, older] in seconds, the last five; it passes over
-pairs closer in time than its historyKeyframeSearchTimeDiff (30 s).
+pairs closer in time than its historyKeyframeSearchTimeDiff (30 s). It knows the stamps of its own run only.
 """
 
 from collections.abc import Sequence
@@ -15,11 +15,13 @@ class LioSamGate:
     def __init__(self) -> None:
         self._last_ns: int | None = None
 
-    def chosen(
-        self, closures: Sequence[LoopClosure], interval_s: float = 1.0, gap_s: float = 30.0
-    ) -> LoopClosure | None:
-        """The best accepted closure at least `gap_s` wide, or None; None too within `interval_s` of the last."""
-        old = [c for c in closures if c.accepted and c.query.stamp_ns - c.match.stamp_ns >= gap_s * 1e9]
+    def chosen(self, closures: Sequence[LoopClosure], interval_s: float, gap_s: float) -> LoopClosure | None:
+        """The best accepted closure within one session and at least `gap_s` wide, or None.
+
+        None too within `interval_s` of the last.
+        """
+        own = [c for c in closures if c.accepted and c.query.session == c.match.session]
+        old = [c for c in own if c.query.stamp_ns - c.match.stamp_ns >= gap_s * 1e9]
         if not old:
             return None
         best = max(old, key=lambda c: c.score)

@@ -12,10 +12,11 @@ from msg_adapters.stamp_ids import StampIds
 from pnv_core.types import ImageRef, LoopClosure
 
 S = 1_000_000_000
+LIMITS = 1.0, 30.0  # least interval of queries, least width
 
 
-def closure(query_s, match_s, score=0.9, accepted=True):
-    query, match = ImageRef(9, round(query_s * S), "camera"), ImageRef(1, round(match_s * S), "camera")
+def closure(query_s, match_s, score=0.9, accepted=True, session=0):
+    query, match = ImageRef(9, round(query_s * S), "camera", session), ImageRef(1, round(match_s * S), "camera")
     return LoopClosure(query, match, score, 0.5, 0.5, 50, accepted)
 
 
@@ -50,7 +51,7 @@ def test_lio_sam_takes_every_message_and_joins_the_key_poses_of_both_images():
     lio_sam, gate = LioSam([float(t) for t in range(100)]), LioSamGate()
     queries = [[closure(40 + q, q, 0.6), closure(40 + q, q + 4, 0.9)] for q in range(20)]
     for found in queries:
-        best = gate.chosen(found)
+        best = gate.chosen(found, *LIMITS)
         if best is not None:
             lio_sam.receive(closure_to_lio_sam(best).data)
     assert lio_sam.loops == [(40 + q, q + 4) for q in range(20)]
@@ -58,10 +59,11 @@ def test_lio_sam_takes_every_message_and_joins_the_key_poses_of_both_images():
 
 def test_a_young_or_refused_closure_does_not_go_to_lio_sam():
     gate = LioSamGate()
-    assert gate.chosen([closure(29.9, 0)]) is None
-    assert gate.chosen([closure(60, 0, accepted=False)]) is None
+    assert gate.chosen([closure(29.9, 0)], *LIMITS) is None
+    assert gate.chosen([closure(60, 0, accepted=False)], *LIMITS) is None
+    assert gate.chosen([closure(60, 0, session=1)], *LIMITS) is None  # a keyframe of a loaded map or an earlier run
     old, young = closure(60, 10, 0.6), closure(60, 40, 0.9)
-    assert gate.chosen([young, old]) is old
+    assert gate.chosen([young, old], *LIMITS) is old
 
 
 @given(st.lists(st.floats(0.05, 3.0), max_size=40), st.floats(0.1, 5.0))
@@ -69,7 +71,7 @@ def test_lio_sam_gets_no_more_than_one_closure_per_interval(steps, interval_s):
     gate, now, sent = LioSamGate(), 100.0, []
     for step in steps:
         now += step
-        best = gate.chosen([closure(now, 0)], interval_s)
+        best = gate.chosen([closure(now, 0)], interval_s, 30.0)
         if best is not None:
             sent.append(best.query.stamp_ns)
     assert all(b - a >= interval_s * S for a, b in itertools.pairwise(sent))
@@ -78,10 +80,10 @@ def test_lio_sam_gets_no_more_than_one_closure_per_interval(steps, interval_s):
 
 def test_a_session_that_begins_earlier_is_not_held_back():
     gate = LioSamGate()
-    assert gate.chosen([closure(1000, 0)]) is not None
+    assert gate.chosen([closure(1000, 0)], *LIMITS) is not None
     gate.forget()
-    assert gate.chosen([closure(999.9, 0)]) is not None
-    assert gate.chosen([closure(100, 0)]) is not None  # a bag in a loop
+    assert gate.chosen([closure(999.9, 0)], *LIMITS) is not None
+    assert gate.chosen([closure(100, 0)], *LIMITS) is not None  # a bag in a loop
 
 
 def test_a_closure_goes_to_the_nearest_nodes_as_soon_as_they_are_certain():
