@@ -1,9 +1,9 @@
 """Which rows of the vector table are most similar to a query. N = rows, D = dimension.
 
 Exact search reads 4 * D bytes a row, the quantised scan D / 4. Measured on 2 cores of an AMD EPYC with AVX-512, one
-thread, D = 256 (benchmarks/database.py): 100,000 rows 3.7 ms exact, 0.8 ms quantised; 1,000,000 rows 55-89 ms exact,
-3-8 ms quantised; recall@10 of the quantised scan at least 0.99 on random and on trajectory-like vectors. HNSW and
-IVF-PQ are slower than the scan at equal recall up to 1,000,000 rows, and poor on random vectors.
+thread, D = 512, processor time (benchmarks/database.py): 100,000 rows 14 ms exact, 2.4 ms quantised; 1,000,000 rows
+159 ms exact, 12 ms quantised; recall@10 of the quantised scan at least 0.998 on random and on trajectory-like vectors.
+HNSW and IVF-PQ are slower than the scan at equal recall, and slower to build.
 """
 
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pnv_core.database.vectors import Allowed, VectorTable
 from pnv_core.errors import ConfigError
 
-EXACT_BYTES = 64_000_000  # above this much to read per query, `auto` scans codes: 2.5 ms here, about 10 ms at 6 GB/s
+EXACT_BYTES = 64_000_000  # above this much to read per query, `auto` scans codes: 5 ms here
 _CATCH_UP = 32  # rows encoded per add while `auto` prepares to leave exact search: 0.3 ms
 
 
@@ -159,11 +159,12 @@ class FaissIndex:
 
     def add(self, slot: int) -> None:
         self._place[slot] = -1
-        if self._built is None or self._rows >= 2 * max(1024, len(self._place)) or self._outgrown():
-            if len(self._place) >= 1024:
-                self._rebuild()
-        else:
+        if self._built is not None and self._rows < 2 * max(1024, len(self._place)) and not self._outgrown():
             self._append(np.array([slot]))
+        elif len(self._place) >= 1024:
+            self._rebuild()
+        else:
+            self._built = None  # so few are searched exactly
 
     def _outgrown(self) -> bool:
         return not hasattr(self._built, "hnsw") and len(self._place) > 4 * self._trained_on  # lists, by the first rows
