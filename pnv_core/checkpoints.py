@@ -63,7 +63,8 @@ def _renamed(content: Any, source: str) -> dict[str, Tensor]:
         tensors[name] = tensor.flatten(1) if name in ("netvlad.assignment", "global_projection.weight") else tensor
     if unexpected:
         raise ModelError(
-            f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; allowed: {', '.join(list(expected)[:2])}, ... WPCA.0.bias"
+            f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; "
+            f"allowed: {', '.join(list(expected)[:2])}, ... WPCA.0.bias"
         )
     if missing := [key for key, name in expected.items() if name not in tensors]:
         raise ModelError(f"{source}: lacks {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}")

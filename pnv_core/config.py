@@ -98,16 +98,37 @@ class Config:
     )
     match_keep: float = setting(0.25, "share of the candidates that coarse matching scores in full", low=0.0, high=1.0)
 
-    verify: int = setting(3, "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept", low=0, high=100)
+    verify: int = setting(
+        3,
+        "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept",
+        low=0,
+        high=100,
+    )
 
     # Decision
     accept_score: float = setting(0.5, "least calibrated score of an accepted closure", low=0.0, high=1.0, live=True)
     min_texture: float = setting(0.05, "images with less texture than this close no loop", low=0.0, high=1.0, live=True)
     consistency: int = setting(3, "neighbouring keyframes that must agree; 0 = none", low=0, high=50, live=True)
-    sure_score: float = setting(0.9, "a closure of at least this score needs no neighbours; above 1 = none is sure", low=0.0, high=1.1, live=True)
-    odometry_drift: float = setting(0.1, "error of odometry per metre gone, where odometry is given; a closure farther off is refused", low=0.0, high=10.0, live=True)
-    odometry_slack_m: float = setting(10.0, "how far apart two views of one place may lie", unit="m", low=0.0, live=True)
-    min_travelled_m: float = setting(1.0, "least way gone between two visits, where odometry is given", unit="m", low=0.0, live=True)
+    sure_score: float = setting(
+        0.9,
+        "a closure of at least this score needs no neighbours; above 1 = none is sure",
+        low=0.0,
+        high=1.1,
+        live=True,
+    )
+    odometry_drift: float = setting(
+        0.1,
+        "error of odometry per metre gone, where odometry is given; a closure farther off is refused",
+        low=0.0,
+        high=10.0,
+        live=True,
+    )
+    odometry_slack_m: float = setting(
+        10.0, "how far apart two views of one place may lie", unit="m", low=0.0, live=True
+    )
+    min_travelled_m: float = setting(
+        1.0, "least way gone between two visits, where odometry is given", unit="m", low=0.0, live=True
+    )
 
     # Memory
     memory_budget_mb: float = setting(

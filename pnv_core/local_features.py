@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pnv_core.parallel import Workers
 
 WIDTH = 320  # pixels; at this width a thumbnail takes about a tenth of a keyframe's patches
+_TALLEST = 4 * WIDTH
 _QUALITY = 85
 _FEATURES = 500
 _CONTRAST = 0.02  # half of SIFT's own threshold: thumbnails are soft
@@ -49,20 +50,23 @@ class EpipolarCheck:
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> bytes:
-    """(H, W, 3) uint8 -> a grey JPEG of at most 320 pixels width and the same aspect."""
+    """(H, W, 3) uint8 -> a grey JPEG of at most 320 pixels width and the same aspect, up to four times as high."""
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
-    if grey.shape[1] > WIDTH:
-        height = max(1, round(grey.shape[0] * WIDTH / grey.shape[1]))
-        grey = cv2.resize(grey, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    if grey.shape[1] > WIDTH or grey.shape[0] > _TALLEST:
+        grey = cv2.resize(grey, (min(WIDTH, grey.shape[1]), _height(grey)), interpolation=cv2.INTER_AREA)
     return cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+
+
+def _height(grey: NDArray[np.uint8]) -> int:
+    """The height at a width of 320 pixels, bounded so that a sliver of an image does not become a gigapixel."""
+    return min(_TALLEST, max(1, round(grey.shape[0] * WIDTH / grey.shape[1])))
 
 
 def detect(picture: bytes, valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
     """A thumbnail, optionally (H, W) bool of the image's pixels to use -> its features, at most 500."""
     grey = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey.shape[1] < WIDTH:  # a small image has details of few pixels; SIFT wants them larger
-        height = max(1, round(grey.shape[0] * WIDTH / grey.shape[1]))
-        grey = cv2.resize(grey, (WIDTH, height), interpolation=cv2.INTER_LINEAR)
+        grey = cv2.resize(grey, (WIDTH, _height(grey)), interpolation=cv2.INTER_LINEAR)
     mask = None
     if valid is not None:
         mask = cv2.resize(valid.astype(np.uint8) * 255, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)

@@ -93,7 +93,7 @@ def make_trunk(name: str, options: dict[str, Any]) -> Trunk:
 
 
 def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Model:
-    """A Model from named tensors; K, C and D come from the shapes. Raises ModelError naming `source` and what differs."""
+    """A Model from named tensors; K, C and D come from the shapes. Raises ModelError naming `source` and the fault."""
     groups: dict[str, dict[str, Tensor]] = {}
     for name, tensor in tensors.items():
         part, _, rest = name.partition(".")

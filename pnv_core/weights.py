@@ -78,7 +78,7 @@ def file_sha256(path: Path) -> str:
 
 
 def fetch(name: str, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
-    """Download a published checkpoint into the cache folder: resumed where it stopped, size checked, renamed when whole.
+    """Download a published checkpoint into the cache folder: resumed where it stopped, checked, renamed.
 
     The publisher gives no hashes: the sha256 of the first complete download is recorded beside the file, and later
     ones must equal it. `progress(done, total)` counts bytes; total is 0 where the server does not say.

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import pytest
 
 from pnv_core.local_features import Verifier, detect, epipolar_check, thumbnail
 
@@ -73,3 +74,12 @@ def test_a_thumbnail_is_small_grey_and_of_the_same_aspect():
     assert len(picture) < 20_000
     assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape == (180, 320)
     assert cv2.imdecode(np.frombuffer(thumbnail(scene(0, (60, 80))), np.uint8), cv2.IMREAD_UNCHANGED).shape == (60, 80)
+
+
+@pytest.mark.parametrize("shape", [(16384, 16), (20000, 1), (1, 1), (16, 16384), (70000, 2)])
+def test_a_sliver_of_an_image_stays_small(shape):
+    """Its picture at 320 pixels width would have up to 6.4 million rows; features are looked for in at most 1280."""
+    rgb = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    picture = cv2.imdecode(np.frombuffer(thumbnail(rgb), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.size <= 320 * 1280
+    assert (detect(thumbnail(rgb)).points <= 4.0).all()
