@@ -123,7 +123,7 @@ class ImageInputs:
             ruling = self._stamps.judge(topic, stamp_ns)
             if ruling.verdict is not StampVerdict.USE:
                 self._tell(topic, ruling.verdict, stamp_ns, ruling.back_ns)
-            if ruling.verdict in (StampVerdict.REPEATED, StampVerdict.BACK):
+            if ruling.verdict not in (StampVerdict.USE, StampVerdict.NEW_SESSION):
                 self._statistics.drop(
                     Drop.STAMP_REPEATED if ruling.verdict is StampVerdict.REPEATED else Drop.STAMP_BACK
                 )
@@ -143,6 +143,10 @@ class ImageInputs:
             self._told.add((topic, verdict))
             if verdict is StampVerdict.REPEATED:
                 log.warning(f"the stamp {stamp} of {topic} repeats; such frames are skipped (said once)")
+            elif verdict is StampVerdict.ENDED_RUN:
+                log.warning(
+                    f"the stamp {stamp} of {topic} belongs to a run that ended; such frames are skipped (said once)"
+                )
             else:
                 log.warning(
                     f"stamps of {topic} went back by {back} to {stamp}; frames are skipped until they pass the last "

@@ -68,7 +68,10 @@ class Recognition:
     def work(self, waiting: WaitingFrame) -> None:
         """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""
         with self._still:
-            if waiting.session != self._session:
+            if waiting.session < self._session:  # waited here while another camera began a new session
+                self._statistics.drop(Drop.STAMP_BACK)
+                return
+            if waiting.session > self._session:
                 self._session = waiting.session
                 self.recognizer.new_session()
                 self.outputs.new_session()

@@ -16,6 +16,7 @@ class StampVerdict(Enum):
     USE = auto()
     REPEATED = auto()  # skipped
     BACK = auto()  # skipped
+    ENDED_RUN = auto()  # skipped: another camera has begun a new session, this one still shows the run before
     NEW_SESSION = auto()  # used; everything before it belongs to an earlier session
 
 
@@ -30,10 +31,13 @@ class StampRule:
     """Stamps of one camera must rise. One that repeats is skipped always, one that goes back by `on_stamp_back`.
 
     A step back of less than REORDERED_NS is a late frame, not a new run, and is skipped either way. The stamp of a
-    frame that turned out to be unusable does not count. Judged by the callbacks, told of unusable frames by the worker.
+    frame that turned out to be unusable does not count. When one camera begins a new session, the others join it as
+    soon as their stamps lie nearer to it than to the end of the run before; until then their frames are skipped.
+    Judged by the callbacks, told of unusable frames by the worker.
     """
 
     REORDERED_NS = 1_000_000_000
+    OVERRUN_NS = 5_000_000_000  # a camera that goes on for longer after a run's end is not at its end
 
     def __init__(self, on_stamp_back: str) -> None:
         self._new_session = on_stamp_back == "new_session"
@@ -41,10 +45,14 @@ class StampRule:
         self._usable: dict[str, int] = {}  # last stamp of a camera not known to be unusable, before `_last`
         self._lock = threading.Lock()
         self._session = 0
+        self._outside: set[str] = set()  # cameras of the run before that have not joined the session
+        self._run_end_ns = 0  # the newest stamp of the run before
 
     def judge(self, camera: str, stamp_ns: int) -> Ruling:
         with self._lock:
             last = self._last.get(camera)
+            if self._in_ended_run(camera, stamp_ns):
+                return Ruling(StampVerdict.ENDED_RUN, self._session)
             if last is None or stamp_ns > last:
                 self._advance(camera, stamp_ns)
                 return Ruling(StampVerdict.USE, self._session)
@@ -53,6 +61,7 @@ class StampRule:
             if not self._new_session or last - stamp_ns < self.REORDERED_NS:
                 return Ruling(StampVerdict.BACK, self._session, last - stamp_ns)
             self._session += 1
+            self._outside, self._run_end_ns = set(self._last), max(self._last.values())
             self._last.clear()
             self._usable.clear()
             self._advance(camera, stamp_ns)
@@ -71,8 +80,15 @@ class StampRule:
         with self._lock:
             self._last.clear()
             self._usable.clear()
+            self._outside.clear()
+
+    def _in_ended_run(self, camera: str, stamp_ns: int) -> bool:
+        if camera not in self._outside or not self._last or stamp_ns > self._run_end_ns + self.OVERRUN_NS:
+            return False
+        return abs(stamp_ns - self._run_end_ns) < abs(stamp_ns - max(self._last.values()))
 
     def _advance(self, camera: str, stamp_ns: int) -> None:
+        self._outside.discard(camera)
         if camera in self._last:
             self._usable[camera] = self._last[camera]
         self._last[camera] = stamp_ns

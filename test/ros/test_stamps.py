@@ -29,6 +29,43 @@ def test_a_looped_bag_begins_one_new_session_for_all_cameras():
     assert rule.judge("rear", 2 * SECOND).session == 1
 
 
+@given(st.permutations("abc"), st.lists(st.sampled_from("abc"), min_size=20, max_size=60), st.integers(2, 5))
+def test_cameras_that_wrap_one_after_another_share_one_session_per_run(order, schedule, runs):
+    """Each camera runs through 0 to 30 s in steps of 0.1 s, at the pace of a random schedule."""
+    rule, step, length = StampRule("new_session"), SECOND // 10, 300
+    count, used = dict.fromkeys(order, 0), {camera: [] for camera in order}
+    while min(count.values()) < runs * length:
+        for camera in (*schedule, *order):
+            if count[camera] - min(count.values()) < 10:  # a second apart at most
+                run, frame = divmod(count[camera], length)
+                ruling = rule.judge(camera, frame * step + order.index(camera))
+                if ruling.verdict in (StampVerdict.USE, StampVerdict.NEW_SESSION):
+                    used[camera].append((ruling.session, run))
+                count[camera] += 1
+    for frames in used.values():
+        assert all(session == run for session, run in frames)
+        assert len(frames) > 0.9 * runs * length
+
+
+def test_a_second_camera_that_wraps_later_joins_the_session_of_the_first():
+    rule = StampRule("new_session")
+    assert verdicts(rule, 90 * SECOND) == ["USE"]
+    assert verdicts(rule, 90 * SECOND, camera="rear") == ["USE"]
+    assert verdicts(rule, 1 * SECOND) == ["NEW_SESSION"]
+    assert verdicts(rule, 91 * SECOND, 92 * SECOND, camera="rear") == ["ENDED_RUN", "ENDED_RUN"]
+    assert verdicts(rule, 2 * SECOND) == ["USE"]
+    assert verdicts(rule, 1 * SECOND, 2 * SECOND, camera="rear") == ["USE", "USE"]
+    assert rule.judge("rear", 3 * SECOND).session == rule.judge("front", 3 * SECOND).session == 1
+
+
+def test_a_camera_that_does_not_wrap_at_all_is_heard_again():
+    rule = StampRule("new_session")
+    assert verdicts(rule, 90 * SECOND) == ["USE"]
+    assert verdicts(rule, 90 * SECOND, camera="rear") == ["USE"]
+    assert verdicts(rule, 1 * SECOND) == ["NEW_SESSION"]
+    assert verdicts(rule, 94 * SECOND, 96 * SECOND, 97 * SECOND, camera="rear") == ["ENDED_RUN", "USE", "USE"]
+
+
 def test_the_stamp_of_an_unusable_frame_holds_nothing_back():
     rule = StampRule("skip")
     assert verdicts(rule, 1 * SECOND, 10**18) == ["USE", "USE"]
