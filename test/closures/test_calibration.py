@@ -75,7 +75,7 @@ def test_an_unknown_model_believes_no_candidate_on_its_patches_alone():
     for spatial in (0.0, 0.1, 0.3, 0.6):
         assert CONSERVATIVE.probability(Evidence(0.9, spatial, 200, 1.0, 0.0)) < 0.5
     assert CONSERVATIVE.probability(Evidence(0.5, 0.1, 50, 0.5, 0.3, local_inliers=8)) < 0.05
-    assert CONSERVATIVE.probability(Evidence(0.5, 0.15, 50, 0.5, 0.3, local_inliers=30)) > 0.9
+    assert CONSERVATIVE.probability(Evidence(0.5, 0.15, 50, 0.5, 0.3, local_inliers=40)) > 0.9
 
 
 def test_expected_calibration_error_by_hand():
