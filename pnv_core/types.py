@@ -84,14 +84,6 @@ class ImageRef:
 
 
 @dataclass(frozen=True, eq=False)
-class Keyframe:
-    """An image in the database."""
-
-    ref: ImageRef
-    descriptor: PlaceDescriptor
-
-
-@dataclass(frozen=True, eq=False)
 class PatchMatches:
     """Mutual nearest neighbours of one patch size: (M,) patch numbers in query and reference, and RANSAC's verdict."""
 
