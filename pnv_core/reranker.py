@@ -14,6 +14,9 @@ from pnv_core.spatial import fused_score, ransac_score, rapid_spatial_score
 from pnv_core.types import PatchMatches, PlaceDescriptor
 
 _COARSE_LEAST = 5  # candidates that coarse matching keeps at least
+# Beside the rapid score of one patch size: of 80 queries with 40 candidates each (Gardens Point, ESSEX3IN1) the best
+# candidate was among the 10 kept in 80 cases with it, in 75 without.
+_COARSE_SIMILARITY = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +84,15 @@ class Reranker:
     def _worth_scoring(
         self, query: PlaceDescriptor, rows: Sequence[PatchRows], references: Sequence[PlaceDescriptor]
     ) -> list[int]:
-        """The best candidates by the rapid score of the cheapest patch size, matched in int8."""
+        """The best candidates by the cheapest patch size, matched in int8, and the similarity of the whole images."""
         keep = max(_COARSE_LEAST, math.ceil(self.keep * len(references)))
         cheapest = min(range(len(rows)), key=lambda s: len(rows[s].rows))
 
         def rough(reference: PlaceDescriptor) -> float:
             grid = reference.patches[cheapest]
             matches = mutual_nearest_rows(rows[cheapest], patch_rows(grid.descriptors), exact=False)
-            return rapid_spatial_score(query.patches[cheapest], grid, matches)
+            similarity = float(query.global_vector @ reference.global_vector)
+            return rapid_spatial_score(query.patches[cheapest], grid, matches) + _COARSE_SIMILARITY * similarity
 
         order = np.argsort(-np.array(self.workers.map(rough, references)), kind="stable")
         return sorted(order[:keep].tolist())
