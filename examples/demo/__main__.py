@@ -18,7 +18,7 @@ from examples.demo.report import LIGHT_AND_LINE, Run, plot, print_table, rows, w
 from examples.listener import listen
 from examples.processes import Process, isolated_environment, node_process, publisher_process
 from examples.publisher import IMAGE_TOPIC
-from examples.sources import add_source_flags, is_file_source, source_flags, world_sequence
+from examples.sources import add_source_flags, is_file_source, named_frames, source_flags, world_sequence
 from pnv_cli.run import COLUMNS
 from pnv_core.errors import PnvError
 from pnv_core.files import atomic_write
@@ -52,6 +52,8 @@ def play(args: argparse.Namespace) -> Run:
     """Start node and publisher, listen until the last frame is dealt with. Raises PnvError where either fails."""
     environment = isolated_environment()
     own = is_file_source(args)
+    if own and next(named_frames(args), None) is None:  # said at once, before anything is started
+        raise PnvError("no frame of the input could be read")
     playback = args.playback or (1.0 if own else 2.0)
     run = Run(truth=None if own else world_sequence(args))
     if run.truth is not None:
