@@ -50,11 +50,12 @@ class Odometry:
 
     def remember(self, keyframe: ImageRef) -> None:
         """Note where a keyframe was taken, if that is known."""
-        position = self.at(keyframe.stamp_ns)
-        if position is not None and keyframe.id >= 0:
-            self._keyframes[keyframe.session, keyframe.id] = position
-            if len(self._keyframes) > _KEYFRAMES:
-                del self._keyframes[next(iter(self._keyframes))]
+        with self._lock:
+            position = self.at(keyframe.stamp_ns)
+            if position is not None and keyframe.id >= 0:
+                self._keyframes[keyframe.session, keyframe.id] = position
+                if len(self._keyframes) > _KEYFRAMES:
+                    del self._keyframes[next(iter(self._keyframes))]
 
     def forget(self) -> None:
         """Start anew, as after a reset or in a new session: another run's odometry has another origin."""

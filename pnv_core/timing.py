@@ -54,8 +54,8 @@ class TimeBudget:
             self._started = self._clock()
 
     def affordable(self, candidates: int, budget_s: float) -> int:
-        """Of so many candidates, how many to re-rank; at least one."""
-        if self._clock is None or not budget_s or not self._each:
+        """Of so many candidates, how many to re-rank; at least one, where there is one."""
+        if self._clock is None or not budget_s or not self._each or not candidates:
             return candidates
         left = budget_s - (self._clock() - self._started)
         return max(1, min(candidates, int(left / float(np.percentile(self._each, _CAUTION)))))

@@ -84,6 +84,7 @@ class MapStore:
             raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")
         database.require_room(manifest.keyframes, sum(len(kf.buffer) for kf in keyframes_of(self.path, manifest)))
         keyframes = keyframes_of(self.path, manifest)
+        self._known = None  # should the restoring fail, the map on disk is not overwritten by what is left
         self._lineage = database.restore(keyframes, manifest.next_id, manifest.next_session)
         self._known = manifest
         return manifest
