@@ -153,7 +153,7 @@ def table(found: Judged) -> list[dict]:
     ways = {
         "global": (lambda c: c.similarity, lambda c: c.similarity >= 0.5),
         "spatial": (lambda c: c.spatial, lambda c: c.spatial >= 0.5),
-        "calibrated": (lambda c: c.score, lambda c: c.score >= 0.5),
+        "calibrated": (lambda c: c.score, lambda c: c.score >= 0.5 and c.evidence.local_inliers >= 0),
         "confirmed": (lambda c: c.score, lambda c: c.accepted),
     }
     for way, (score, accepts) in ways.items():
