@@ -60,25 +60,22 @@ class Judge:
                 spatial_lead=min((result.score - scored[i].score for i in elsewhere if i in scored), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
             )
-            found.append((self._closure(query, ref, evidence, result, config.min_texture), number))
+            found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
         found.sort(key=lambda pair: _rank(pair[0]))
         if descriptor.thumbnail and config.verify:
-            pictures = [(candidates[i][2].thumbnail, closure.match.camera) for closure, i in found[: config.verify]]
+            pictures = [(candidates[i][2].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
             shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
             self.verifier.look_at(shown, self.reranker.workers)
-        for place, (closure, number) in enumerate(found[: config.verify]):
+        for place, (closure, evidence, number) in enumerate(found[: config.verify]):
             picture = candidates[number][2].thumbnail
             if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
-                seen = replace(closure.evidence, local_inliers=check.inliers, local_spread=check.spread)
-                found[place] = (
-                    self._closure(query, closure.match, seen, scored[number], config.min_texture),
-                    number,
-                )
-        closures = [closure for closure, _ in found]
+                seen = replace(evidence, local_inliers=check.inliers, local_spread=check.spread)
+                verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
+                found[place] = verified, seen, number
         # what ranked lower and was not examined is not believed more than what was
-        most = max((c.score for c in closures if c.evidence.local_inliers >= 0), default=1.0)
-        closures = [c if c.evidence.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c in closures]
+        most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
+        closures = [c if e.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c, e, _ in found]
         rest = [_not_reranked(query, *candidates[i], descriptor.texture) for i in left_out]
         return sorted(closures + rest, key=_rank)
 

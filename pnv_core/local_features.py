@@ -6,6 +6,7 @@ N = features of an image, M = matches.
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -57,6 +58,12 @@ def thumbnail(rgb: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
 
 
+def _decoded(picture: bytes) -> NDArray[np.uint8]:
+    """(h, w) grey; a damaged picture shows nothing."""
+    grey: Any = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+    return np.zeros((WIDTH, WIDTH), np.uint8) if grey is None else grey
+
+
 def _height(grey: NDArray[np.uint8]) -> int:
     """The height at a width of 320 pixels, bounded so that a sliver of an image does not become a gigapixel."""
     return min(_TALLEST, max(1, round(grey.shape[0] * WIDTH / grey.shape[1])))
@@ -64,21 +71,20 @@ def _height(grey: NDArray[np.uint8]) -> int:
 
 def detect(picture: bytes, valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
     """A thumbnail, optionally (H, W) bool of the image's pixels to use -> its features, at most 500."""
-    grey = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+    grey = _decoded(picture)
     if grey.shape[1] < WIDTH:  # a small image has details of few pixels; SIFT wants them larger
         grey = cv2.resize(grey, (WIDTH, _height(grey)), interpolation=cv2.INTER_LINEAR)
     mask = None
     if valid is not None:
         mask = cv2.resize(valid.astype(np.uint8) * 255, grey.shape[::-1], interpolation=cv2.INTER_NEAREST)
         mask = cv2.erode(mask, np.ones((9, 9), np.uint8))  # the border of the mask is no feature
-    keypoints, descriptors = cv2.SIFT_create(nfeatures=_FEATURES, contrastThreshold=_CONTRAST).detectAndCompute(
-        grey, mask
-    )
+    sift = getattr(cv2, "SIFT_create")(nfeatures=_FEATURES, contrastThreshold=_CONTRAST)  # noqa: B009 - no stub has it
+    keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
         return LocalFeatures(np.empty((0, 2), np.float32), np.empty((0, 128), np.float32))
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
     points = np.array([k.pt for k in keypoints], np.float32) + 0.5
-    return LocalFeatures(points / WIDTH, root.astype(np.float32))
+    return LocalFeatures((points / WIDTH).astype(np.float32), root.astype(np.float32))
 
 
 def match(query: LocalFeatures, reference: LocalFeatures) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -136,7 +142,7 @@ class Verifier:
 
     def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
         """Two thumbnails and the cameras that took them."""
-        grey = cv2.imdecode(np.frombuffer(query, np.uint8), cv2.IMREAD_GRAYSCALE)
+        grey = _decoded(query)
         return epipolar_check(
             self._detected(query, query_camera),
             self._detected(reference, reference_camera),

@@ -11,7 +11,7 @@ from pnv_core.keyframes import KeyframeSelector
 from pnv_core.local_features import thumbnail
 from pnv_core.odometry import Odometry
 from pnv_core.timing import StageTimer, TimeBudget
-from pnv_core.types import Frame, ImageRef, LoopClosure, Reason
+from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, Reason
 
 
 class PlaceRecognizer:
@@ -98,11 +98,12 @@ class PlaceRecognizer:
         config = self.config
         if closure.reason is Reason.NOT_RERANKED:
             return closure
-        if closure.evidence.texture < config.min_texture:
+        evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
+        if evidence.texture < config.min_texture:
             return replace(closure, reason=Reason.LOW_TEXTURE)
         if closure.score < config.accept_score:
             return replace(closure, reason=Reason.LOW_SCORE)
-        if config.verify and closure.evidence.local_inliers < 0:
+        if config.verify and evidence.local_inliers < 0:
             return replace(closure, reason=Reason.NOT_VERIFIED)
         gate = config.odometry_drift, config.odometry_slack_m, config.min_travelled_m
         if self.odometry.impossible(closure.query, closure.match, *gate):

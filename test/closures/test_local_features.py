@@ -50,6 +50,11 @@ def test_a_blank_picture_has_no_features_and_agrees_with_nothing():
     assert epipolar_check(features(blank), features(blank), 0.75).spread == 0.0
 
 
+def test_a_damaged_picture_of_a_map_agrees_with_nothing():
+    damaged = b"\xff\xd8\xff no picture"
+    assert Verifier().check(thumbnail(scene(0)), "front", damaged, "front").inliers == 0
+
+
 def test_a_repeated_pattern_is_no_evidence():
     tile = scene(3, (48, 64))
     tiled = np.tile(tile, (10, 10, 1))
