@@ -49,12 +49,12 @@ def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -
 def icl_office(folder: Path) -> Walk:
     """ICL-NUIM office kt3, carried by hand: 7.7 m of way, one turn around. The end returns to the start.
 
-    Its poses have x right, y down, z ahead and the heading to the right; the way is short for its turns, so the
+    Its poses have x right, y up, z ahead and the heading to the right; the way is short for its turns, so the
     drift is that of the turns.
     """
 
     def pose(x: float, y: float, z: float, yaw: float) -> Pose:
-        return Pose(z, -x, -y, -yaw)
+        return Pose(z, -x, y, -yaw)
 
     stamps, truth = _poses(folder / "poses.csv", pose)
     drift = Drift(deg_per_m=0.0, turn=0.08)
