@@ -68,7 +68,8 @@ def graph_to_g2o(
         if pose is None or not pose.metric or pose.covariance is None:
             lines.append(f"# closure {a} {b} score {closure.score:.6f} without scale")
         else:
-            lines.append(_edge(a, b, pose.translation, pose.quaternion, np.linalg.inv(pose.covariance).astype(np.float64)))
+            information = np.linalg.inv(pose.covariance).astype(np.float64)
+            lines.append(_edge(a, b, pose.translation, pose.quaternion, information))
     return "\n".join(lines) + "\n"
 
 
