@@ -49,7 +49,9 @@ class Diagnostics:
         silent = self._silent(now, settings.node.no_image_warning_s, settings.node.image_topics)
         self._log_silence(now, {} if inputs.paused else silent, inputs)
 
-        if inputs.paused:
+        if self._statistics.autosave_failure:
+            level, text = DiagnosticStatus.ERROR, f"autosave: {self._statistics.autosave_failure}"
+        elif inputs.paused:
             level, text = DiagnosticStatus.OK, "paused"
         elif silent:
             topic, seconds = next(iter(silent.items()))
@@ -87,6 +89,7 @@ class Diagnostics:
             "memory budget [MB]": f"{stats.bytes_budget / 1e6:.1f}",
             "best score of late": "none" if score is None else f"{score:.3f}",
             "accept_score": f"{settings.recogniser.accept_score:.3f}",
+            "last autosave": self._statistics.autosave_failure or "no failure",
             "closures": str(self._statistics.closures),
             "last closure": self._statistics.last_closure or "none",
             **{f"{stage} p50, p95 [ms]": f"{p50:.1f}, {p95:.1f}" for stage, (p50, p95) in stages.items()},

@@ -55,8 +55,12 @@ class ImageInputs:
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
         self._mismatches: dict[str, str] = {}  # topic: policy
-        for topic in config.image_topics:
-            self._subscribe(topic, self._expected_type(topic))
+        try:
+            for topic in config.image_topics:
+                self._subscribe(topic, self._expected_type(topic))
+        except Exception:
+            self.close()
+            raise
 
     def close(self) -> None:
         for subscription in self._subscriptions.values():

@@ -31,7 +31,7 @@ from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Parameters, Settings
 from pnv_ros.recognition import Recognition
 from pnv_ros.saved_map import SavedMap
-from pnv_ros.services import create_services
+from pnv_ros.services import Services
 from pnv_ros.slot import NewestFrames
 from pnv_ros.stamps import StampRule
 from pnv_ros.statistics import Statistics
@@ -64,7 +64,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._autosave: Autosave | None = None
         self._statistics = Statistics()
         self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
-        create_services(self, self)
+        self._own_services = Services(self, self)
         # steady: a paused simulation or bag stops neither diagnostics nor the warning that no image comes
         self._second = self.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._service_change_state.callback = self._changing_state(self._service_change_state.callback)
@@ -72,6 +72,11 @@ class PlaceRecognizerNode(LifecycleNode):
     @property
     def settings(self) -> Settings:
         return self._declared.settings
+
+    @property
+    def idle(self) -> bool:
+        """Whether every service call was answered."""
+        return self._own_services.idle
 
     def start(self) -> bool:
         """Configure and activate; whether both succeeded."""
@@ -93,15 +98,12 @@ class PlaceRecognizerNode(LifecycleNode):
         return SUCCESS
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        assert self._recognition is not None
-        assert self._diagnostics is not None
-        frames = NewestFrames()
-        self._diagnostics.forget()
-        self._inputs = ImageInputs(self, self.settings.node, frames, self._statistics, self._stamps)
-        self._worker = Worker(frames, self._recognition.work, self._failed)
-        self._worker.start()
-        topics = "\n".join(f"  listens to   {self._inputs.describe(t)}" for t in self.settings.node.image_topics)
-        self.get_logger().info(f"active\n{topics}\n  publishes    {self.resolve_topic_name('loop_closures')}")
+        try:
+            self._activate()
+        except Exception:
+            self.get_logger().error(f"cannot be activated:\n{traceback.format_exc()}")
+            self._stop()
+            return FAILURE
         return SUCCESS
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -137,22 +139,24 @@ class PlaceRecognizerNode(LifecycleNode):
     # Services
 
     def save(self) -> str:
-        if self._map is None:
+        saved_map = self._map
+        if saved_map is None:
             raise PnvError(NOT_CONFIGURED)
-        return f"saved {self._map.save()}"
+        return f"saved {saved_map.save()}"
 
     def load(self) -> str:
-        if self._map is None or self._recognition is None:
+        saved_map, recognition = self._map, self._recognition
+        if saved_map is None or recognition is None:
             raise PnvError(NOT_CONFIGURED)
-        with self._recognition.still():
-            count = self._map.load()
-            self._recognition.map_was_replaced()
-        return f"loaded {count} keyframes from {self._map.path}; a new session begins"
+        path = saved_map.path
+        count = saved_map.load(recognition.still(), recognition.map_was_replaced)
+        return f"loaded {count} keyframes from {path}; a new session begins"
 
     def reset(self) -> str:
-        if self._recognition is None:
+        recognition = self._recognition
+        if recognition is None:
             raise PnvError(NOT_CONFIGURED)
-        count = self._recognition.reset()
+        count = recognition.reset()
         return f"forgot {count} keyframes"
 
     def pause(self, on: bool) -> str:
@@ -185,6 +189,11 @@ class PlaceRecognizerNode(LifecycleNode):
         self._others = self._subscribe_others(recognizer, outputs, views, poses)
         self._map = SavedMap(database, describer.map_fingerprint)
         self._map.path = config.map_path
+        if config.autosave and not config.load_on_start and self._map.exists():
+            raise ConfigError(
+                f"autosave is true, but {config.map_path} holds a map that is not loaded and would not be overwritten; "
+                "allowed: load_on_start: true to go on with it, another map_path, or autosave: false"
+            )
         if config.load_on_start:
             self.get_logger().info(self.load() if self._map.exists() else f"no map at {config.map_path} yet")
         if config.autosave:
@@ -193,6 +202,17 @@ class PlaceRecognizerNode(LifecycleNode):
         self.get_logger().info(
             self._summary(describer, per_keyframe) + f"\n  configured   in {time.monotonic() - start:.1f} s"
         )
+
+    def _activate(self) -> None:
+        assert self._recognition is not None
+        assert self._diagnostics is not None
+        frames = NewestFrames()
+        self._diagnostics.forget()
+        self._inputs = ImageInputs(self, self.settings.node, frames, self._statistics, self._stamps)
+        self._worker = Worker(frames, self._recognition.work, self._failed)
+        self._worker.start()
+        topics = "\n".join(f"  listens to   {self._inputs.describe(t)}" for t in self.settings.node.image_topics)
+        self.get_logger().info(f"active\n{topics}\n  publishes    {self.resolve_topic_name('loop_closures')}")
 
     def _summary(self, describer: Describer, per_keyframe: int) -> str:
         config, info = describer.config, describer.model.info
@@ -234,7 +254,8 @@ class PlaceRecognizerNode(LifecycleNode):
         def odometry(message: Odometry) -> None:
             position = message.pose.pose.position
             recognizer.odometry.add(stamp_of(message), position.x, position.y, position.z)
-            outputs.markers.track.add(message)
+            if not config.pose_topic:
+                outputs.markers.track.add(message)
 
         for kind, topic, receive in (
             (Odometry, config.odometry_topic, odometry),
@@ -280,6 +301,7 @@ class PlaceRecognizerNode(LifecycleNode):
             self._worker = None
 
     def _report_autosave(self, done: SaveReport | MapError) -> None:
+        self._statistics.autosave_failure = str(done) if isinstance(done, MapError) else ""
         if isinstance(done, MapError):
             self.get_logger().error(f"autosave: {done}")
         else:

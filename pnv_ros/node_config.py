@@ -2,6 +2,11 @@
 
 from dataclasses import dataclass
 
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.expand_topic_name import expand_topic_name
+from rclpy.validate_full_topic_name import validate_full_topic_name
+from rclpy.validate_topic_name import validate_topic_name
+
 from pnv_core.errors import ConfigError
 from pnv_core.settings import checked, setting
 
@@ -29,7 +34,8 @@ class NodeConfig:
         (), "CameraInfo topics, one per camera; images are rectified by them, ~/relative_pose needs them", kind=str
     )
     odometry_topic: str = setting(
-        "", "nav_msgs/Odometry: rules closures out, scales ~/relative_pose, places keyframes in ~/markers"
+        "",
+        "nav_msgs/Odometry: rules closures out, scales ~/relative_pose; places keyframes where pose_topic is empty",
     )
     pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
 
@@ -55,7 +61,7 @@ class NodeConfig:
     publish_candidates: bool = setting(True, "publish ~/candidates while somebody subscribes", live=True)
     publish_markers: bool = setting(True, "publish ~/markers while somebody subscribes", live=True)
     publish_match_image: bool = setting(True, "publish ~/match_image while somebody subscribes", live=True)
-    publish_lio_sam: bool = setting(True, "publish ~/lio_sam", live=True)
+    publish_lio_sam: bool = setting(True, "publish ~/lio_sam: closures within this run", live=True)
     lio_sam_interval_s: float = setting(
         1.0, "least time between the queries of ~/lio_sam", unit="s", low=0.0, high=1e6, live=True
     )
@@ -77,6 +83,21 @@ class NodeConfig:
             raise ConfigError(
                 f"camera_info_topics has {len(self.camera_info_topics)} entries; allowed: 0 or one per image topic"
             )
+        for name in ("image_topics", "camera_info_topics", "odometry_topic", "pose_topic"):
+            given = getattr(self, name)
+            for topic in given if isinstance(given, tuple) else filter(None, [given]):
+                _check_topic(name, topic)
         for name in ("load_on_start", "autosave", "read_only"):
             if getattr(self, name) and not self.map_path:
                 raise ConfigError(f"{name} is true but map_path is empty; allowed: a folder")
+
+
+def _check_topic(name: str, topic: str) -> None:
+    try:
+        validate_topic_name(topic)
+        validate_full_topic_name(expand_topic_name(topic, "node", "/"))
+    except (InvalidTopicNameException, ValueError) as error:
+        why = str(error).splitlines()[0].removeprefix("Invalid topic name: ").split(", at ")[0].rstrip(":")
+        raise ConfigError(
+            f"{name} names {topic!r}: {why}; allowed: letters, digits, _ and /, as in camera/image_raw"
+        ) from None

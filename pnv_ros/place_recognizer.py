@@ -21,6 +21,7 @@ class Spinning:
     """Callbacks in a thread of their own, so that the main thread is free to hear signals."""
 
     def __init__(self, node: PlaceRecognizerNode, failed: "SimpleQueue[BaseException | int]") -> None:
+        self._node = node
         self._executor, self._failed, self._ended = SingleThreadedExecutor(), failed, threading.Event()
         self._executor.add_node(node)
         self._thread = threading.Thread(target=self._spin, name="callbacks", daemon=True)
@@ -28,13 +29,13 @@ class Spinning:
 
     def _spin(self) -> None:
         try:
-            while not self._ended.is_set():
+            while not (self._ended.is_set() and self._node.idle):
                 self._executor.spin_once()
         except BaseException as failure:
             self._failed.put(failure)
 
     def end(self) -> None:
-        """Returns when the callback in hand is done."""
+        """Returns when the callback in hand is done and every service call answered."""
         self._ended.set()
         self._executor.create_task(lambda: None)  # ends the wait
         self._thread.join()

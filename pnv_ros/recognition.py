@@ -36,6 +36,8 @@ class Recognition:
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
         self._statistics, self._stamps, self._log = statistics, stamps, log
         self._session = 0
+        self._wanted: Settings | None = None  # None: as configured
+        self._taken: Settings | None = None
         self._still = threading.Lock()
         self._sizes: dict[str, tuple[int, int]] = {}
         self._complained: dict[str, float] = {}
@@ -45,10 +47,8 @@ class Recognition:
         return self._still
 
     def change(self, settings: Settings) -> None:
-        """New live settings, all at once, from the next frame on."""
-        with self._still:
-            self.recognizer.change(settings.recogniser)
-            self.outputs.config = settings.node
+        """New live settings, all at once, from the next frame on. Never waits."""
+        self._wanted = settings
 
     def reset(self) -> int:
         """Forget every keyframe and stamp; how many keyframes there were."""
@@ -68,6 +68,11 @@ class Recognition:
     def work(self, waiting: WaitingFrame) -> None:
         """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""
         with self._still:
+            wanted = self._wanted
+            if wanted is not None and wanted is not self._taken:
+                self._taken = wanted
+                self.recognizer.change(wanted.recogniser)
+                self.outputs.config = wanted.node
             if waiting.session < self._session:  # waited here while another camera began a new session
                 self._statistics.drop(Drop.STAMP_BACK)
                 return

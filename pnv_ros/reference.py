@@ -23,13 +23,13 @@ REASONS = {
     Reason.LOW_TEXTURE: "the image shows next to nothing (min_texture)",
     Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency)",
     Reason.ODOMETRY: "the jump is impossible by odometry",
-    Reason.NOT_RERANKED: "left out to keep within time_budget_ms",
+    Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms or by match_mode (bounded, coarse)",
     Reason.NOT_VERIFIED: "not among the best that local features examined (verify)",
 }
 DROPS = {
     Drop.BUSY: "a newer frame of the camera came before the worker was free",
     Drop.STAMP_REPEATED: "the header stamp equals the camera's last one",
-    Drop.STAMP_BACK: "the header stamp lies before the camera's last one (on_stamp_back)",
+    Drop.STAMP_BACK: "the header stamp lies before the camera's last one, or in a run that ended (on_stamp_back)",
     Drop.UNUSABLE: "the message is damaged, of an unknown encoding, or out of size limits",
     Drop.NO_CAMERA_INFO: "camera_info_topics is set and no CameraInfo has come yet",
     Drop.PAUSED: "~/pause",
@@ -148,10 +148,12 @@ match older; the exact stamp is (floor(column 0), column 5) and (floor(column 1)
 `image_topics`; -1 is a camera of a loaded map that is not among them. Columns are only ever appended.
 `msg_adapters.loop_closures.closures_from_message` reads it.
 
-**`~/lio_sam`**: exactly two doubles, query and match in epoch seconds, at least `lio_sam_gap_s` apart.
+**`~/lio_sam`**: exactly two doubles, query and match in epoch seconds, at least `lio_sam_gap_s` apart and
+of the same session: LIO-SAM knows the stamps of its own run only, so nothing is sent about the places of a loaded map.
 
 **`~/relative_pose`**: the query's camera (optical frame) in the frame `keyframe_<match id>`, in metres. It needs
-`camera_info_topics` and, for the scale, `odometry_topic`; sent while somebody subscribes.
+`camera_info_topics` and, for the scale, `odometry_topic`; sent while somebody subscribes. With
+`read_only` none is sent, since the query is no keyframe (its id is -1); nor do its closures appear in `~/markers`.
 
 **`~/candidates`**: every candidate examined, refused ones too, one point each: {candidate_fields}. Reasons:
 
@@ -166,6 +168,10 @@ match older; the exact stamp is (floor(column 0), column 5) and (floor(column 1)
 | `~/reset` | std_srvs/Trigger | forget every keyframe, and the stamps seen |
 | `~/pause` | std_srvs/SetBool | drop images until set to false; the map is kept |
 
+Images go on being processed while a map is written; `~/load` and `~/reset` wait for the frame in hand. `autosave`
+without `load_on_start` is refused where `map_path` already holds a map, since a map that was not loaded is never
+overwritten. An autosave that fails turns `/diagnostics` to ERROR until one succeeds.
+
 ## Life cycle
 
 The node is a managed node (`ros2 lifecycle set /place_recognizer configure`, and so on). Configure loads the model and
@@ -178,7 +184,8 @@ after the frame in hand with status 0; a failure while running ends it with the 
 Only header stamps count, never the wall clock. The stamps of a camera must rise. A frame whose stamp repeats is
 skipped. A frame whose stamp goes back by less than a second is late and skipped. One that goes back further is
 skipped too (`on_stamp_back: skip`), until the stamps pass the last one or `~/reset` is called, or begins a new session
-(`on_stamp_back: new_session`), against whose predecessors closures are then found. Each is said once in the log.
+(`on_stamp_back: new_session`), against whose predecessors closures are then found. Other cameras join that session when
+their stamps go back too; what they show of the run before until then is skipped. Each is said once in the log.
 `use_sim_time` stamps /diagnostics; nothing else depends on a clock.
 
 Frames that are received and not processed are counted in `/diagnostics`:

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 from pnv_core.database import KeyframeDatabase, Snapshot
 from pnv_core.errors import MapError
@@ -9,12 +10,15 @@ from pnv_core.maps import Autosave, MapStore, SaveReport
 
 
 class SavedMap:
-    """Saves and loads a database at a path that may change; one thread at a time."""
+    """Saves and loads a database at a path that may change; one thread at a time.
+
+    The path can be changed while a save is under way, which then ends where it began.
+    """
 
     def __init__(self, database: KeyframeDatabase, fingerprint: str) -> None:
         self._database, self._fingerprint = database, fingerprint
         self._store: MapStore | None = None
-        self._lock = threading.Lock()
+        self._writing = threading.Lock()
         self._path = ""
 
     @property
@@ -23,9 +27,8 @@ class SavedMap:
 
     @path.setter
     def path(self, path: str) -> None:
-        with self._lock:
-            if path != self._path:
-                self._path, self._store = path, MapStore(path, self._fingerprint) if path else None
+        if path != self._path:
+            self._path, self._store = path, MapStore(path, self._fingerprint) if path else None
 
     def exists(self) -> bool:
         """Whether a map was saved there before."""
@@ -34,14 +37,18 @@ class SavedMap:
     def save(self, snapshot: Snapshot | None = None) -> SaveReport:
         """Save the database, or a snapshot of it. Raises MapError; the map on disk is then as it was."""
         store = self._opened()
-        with self._lock:
+        with self._writing:
             return store.save(snapshot or self._database.snapshot())
 
-    def load(self) -> int:
-        """Replace the database's content and begin a new session; the number of keyframes. Raises MapError."""
+    def load(self, still: AbstractContextManager[object], loaded: Callable[[], None]) -> int:
+        """Replace the database's content and begin a new session; the number of keyframes. Raises MapError.
+
+        A save under way is waited for first. `still` is entered after that and held until `loaded` has returned.
+        """
         store = self._opened()
-        with self._lock:
+        with self._writing, still:
             store.load(self._database)
+            loaded()
             return len(self._database)
 
     def autosave(self, interval_s: float, report: Callable[[SaveReport | MapError], None]) -> Autosave:
@@ -49,6 +56,7 @@ class SavedMap:
         return Autosave(self._database, self, interval_s, report)  # type: ignore[arg-type]
 
     def _opened(self) -> MapStore:
-        if self._store is None:
+        store = self._store
+        if store is None:
             raise MapError("map_path is empty; allowed: a folder, set by the parameter map_path")
-        return self._store
+        return store

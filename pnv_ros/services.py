@@ -1,16 +1,22 @@
 """The services: save, load, reset, pause. Each answers with what it did, or why not."""
 
+import threading
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from pnv_core.errors import PnvError
 
 
 class Controls(Protocol):
-    """What a service may do to the node. Each gives a sentence or raises PnvError or OSError."""
+    """What a service may do to the node. Each gives a sentence or raises PnvError or OSError.
+
+    save, load and reset are called from threads of their own, one at a time; pause from the callbacks' thread.
+    """
 
     def save(self) -> str: ...
     def load(self) -> str: ...
@@ -18,23 +24,60 @@ class Controls(Protocol):
     def pause(self, on: bool) -> str: ...
 
 
-def create_services(node: Node, controls: Controls) -> None:
-    """Offer ~/save, ~/load, ~/reset (std_srvs/Trigger) and ~/pause (std_srvs/SetBool)."""
+class Services:
+    """~/save, ~/load, ~/reset (std_srvs/Trigger) and ~/pause (std_srvs/SetBool).
 
-    def answer(response: Any, act: Callable[[], str]) -> Any:
-        try:
-            response.success, response.message = True, act()
-            node.get_logger().info(response.message)
-        except (PnvError, OSError, MemoryError) as error:
-            response.success, response.message = False, str(error)
-            node.get_logger().error(response.message)
+    The first three may take seconds. They run beside the executor, which goes on with images meanwhile.
+    """
+
+    def __init__(self, node: Node, controls: Controls) -> None:
+        self._node = node
+        self._pending = 0
+        one_at_a_time = MutuallyExclusiveCallbackGroup()
+        for name in ("save", "load", "reset"):
+            act = self._beside(getattr(controls, name))
+            node.create_service(Trigger, f"~/{name}", act, callback_group=one_at_a_time)
+
+        def pause(request: Any, response: Any) -> Any:
+            return self._answered(response, _outcome(lambda: controls.pause(request.data)))
+
+        node.create_service(SetBool, "~/pause", pause)
+
+    @property
+    def idle(self) -> bool:
+        """Whether every call was answered."""
+        return self._pending == 0
+
+    def _beside(self, act: Callable[[], str]) -> Callable[..., Any]:
+        async def serve(_: Any, response: Any) -> Any:
+            done = Future()
+            threading.Thread(target=self._run, args=(act, done), name="service", daemon=True).start()
+            self._pending += 1
+            try:
+                return self._answered(response, await done)
+            finally:
+                self._pending -= 1
+
+        return serve
+
+    def _run(self, act: Callable[[], str], done: Future) -> None:
+        done.set_result(_outcome(act))
+        if self._node.executor is not None:
+            self._node.executor.wake()
+
+    def _answered(self, response: Any, outcome: str | Exception) -> Any:
+        if isinstance(outcome, str):
+            self._node.get_logger().info(outcome)
+        elif isinstance(outcome, PnvError | OSError | MemoryError):
+            self._node.get_logger().error(str(outcome))
+        else:
+            raise outcome
+        response.success, response.message = isinstance(outcome, str), str(outcome)
         return response
 
-    node.create_service(Trigger, "~/save", lambda _, response: answer(response, controls.save))
-    node.create_service(Trigger, "~/load", lambda _, response: answer(response, controls.load))
-    node.create_service(Trigger, "~/reset", lambda _, response: answer(response, controls.reset))
 
-    def pause(request: Any, response: Any) -> Any:
-        return answer(response, lambda: controls.pause(request.data))
-
-    node.create_service(SetBool, "~/pause", pause)
+def _outcome(act: Callable[[], str]) -> str | Exception:
+    try:
+        return act()
+    except Exception as error:
+        return error

@@ -29,6 +29,7 @@ class Statistics:
         self.processed = 0
         self.closures = 0
         self.last_closure = ""
+        self.autosave_failure = ""  # of the last autosave; empty where it succeeded
         self.best_scores: deque[float] = deque(maxlen=_KEPT_SCORES)  # of the latest queries with candidates
 
     def receive(self, camera: str) -> None:

@@ -151,17 +151,20 @@ def test_a_clock_that_jumps_is_survived_reset_starts_time_anew_and_sizes_may_cha
 
 def test_a_full_disk_while_saving_is_told_and_frames_go_on(listener, tmp_path):
     health, limit = Health(listener), 60_000
-    with running_node(map_path=tmp_path / "map", **EAGER) as node:
+    with running_node(map_path=tmp_path / "map", autosave=True, autosave_interval_s=2.0, **EAGER) as node:
         camera = Camera(listener, health, "camera/image_raw")
         camera.send(image(scene(1), at(1)))
         camera.send(image(scene(2), at(2)))
         resource.prlimit(node.child.pid, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+        camera.send(image(scene(3), at(3)))
         answer = trigger(listener, "save")
         assert not answer.success
         assert "cannot save" in answer.message
-        camera.send(image(scene(3), at(3)))
+        wait_until(lambda: health.status.level == b"\x02", 30, "an error on /diagnostics")
+        assert health.status.message.startswith("autosave: cannot save")
         resource.prlimit(node.child.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         assert trigger(listener, "save").message.startswith(f"saved {tmp_path / 'map'}: 3 keyframes")
+        wait_until(lambda: health.status.level == b"\x00", 30, "diagnostics without an error")
         assert node.end() == 0
 
 

@@ -64,6 +64,7 @@ def test_the_life_cycle_keeps_the_map_when_inactive_and_frees_it_on_clean_up(dom
     [
         ({"accept_score": 1.5}, "accept_score"),
         ({"image_topics": ["a", "a"]}, "allowed: one or more different topic names"),
+        ({"image_topics": ["bad topic"]}, "image_topics names 'bad topic'"),
         ({"memory_budget_mb": 1, "image_width": 1280, "image_height": 960, "patch_precision": "float32"},
          "holds no keyframe"),
     ],
@@ -160,6 +161,9 @@ def test_a_node_restarted_with_its_map_recognises_yesterdays_places(domain, list
         assert (found.match.stamp_ns, found.query.id) == (at(2), -1)
         assert health.count("keyframes") == 4
         assert node.end() == 0
+    ignored = Process(executable(), *ros_arguments(map_path=map_path, autosave=True))
+    assert ignored.wait() == 2
+    assert "holds a map that is not loaded and would not be overwritten; allowed: load_on_start" in ignored.output
 
 
 def test_an_incompatible_publisher_is_reported_with_both_profiles_and_the_remedy(domain, listener):
