@@ -15,6 +15,11 @@ EPOCH_S = 1_700_000_000
 RELIABLE = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
 
 
+def reliable(*topics: str) -> dict[str, str]:
+    """Parameters for tests that count frames: best effort, the default, may lose one on a machine short of time."""
+    return {f"qos_overrides./{topic}.subscription.reliability": "reliable" for topic in topics}
+
+
 def scene(seed: int, width: int = 320, height: int = 240) -> np.ndarray:
     """(height, width, 3) uint8: a place made of sixty shapes, the same for the same seed."""
     random = np.random.default_rng(seed)
@@ -46,13 +51,13 @@ class Camera:
     def __init__(self, listener: Listener, health: "Health", topic: str, kind: type = Image, qos: Any = RELIABLE):
         self._publisher = listener.node.create_publisher(kind, topic, qos)
         self._health = health
-        wait_until(self._publisher.get_subscription_count, 30, f"a subscription of {topic}")
+        wait_until(self._publisher.get_subscription_count, 60, f"a subscription of {topic}")
 
     def send(self, message: Any, wait: bool = True) -> None:
         before = self._health.dealt_with()
         self._publisher.publish(message)
         if wait:
-            wait_until(lambda: self._health.dealt_with() > before, 30, "the node to take a frame")
+            wait_until(lambda: self._health.dealt_with() > before, 60, "the node to take a frame")
 
 
 class Health:
@@ -65,7 +70,7 @@ class Health:
     @property
     def status(self) -> Any:
         """The latest status."""
-        return wait_until(self._latest, 30, "diagnostics")
+        return wait_until(self._latest, 60, "diagnostics")
 
     def _latest(self) -> Any:
         return next((s for m in reversed(self._messages) for s in m.status if s.hardware_id == self._node), None)
@@ -84,5 +89,5 @@ class Health:
     def fresh(self) -> Any:
         """A status published from now on."""
         seen = len(self._messages)
-        wait_until(lambda: len(self._messages) > seen + 1, 30, "fresh diagnostics")
+        wait_until(lambda: len(self._messages) > seen + 1, 60, "fresh diagnostics")
         return self.status

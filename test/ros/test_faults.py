@@ -22,14 +22,14 @@ from std_msgs.msg import Float64MultiArray
 
 from pnv_ros.outputs import CLOSURES_QOS
 from pnv_ros.parameters import DECLARED
-from test.ros.camera import EPOCH_S, Camera, Health, image, scene
+from test.ros.camera import EPOCH_S, Camera, Health, image, reliable, scene
 from test.ros.controls import trigger
 from test.ros.malform import png_claiming
 from test.ros.processes import NODE, ROOT, Listener, Process, publisher, running_node, wait_until
 
 pytestmark = pytest.mark.process
 FULL = os.environ.get("PNV_ROS_FAULTS") == "full"
-EAGER = {"min_interval_s": 0.0, "min_change": 0.0, "consistency": 0}
+EAGER = {"min_interval_s": 0.0, "min_change": 0.0, "consistency": 0} | reliable("camera/image_raw", "front", "rear")
 STILL = {"min_interval_s": 0.0, "min_change": 2.0}  # one keyframe, so that memory has no reason to grow
 MOST_THREADS = 40  # the middleware's and torch's own, counted once at rest: about 25
 
@@ -47,9 +47,9 @@ def noise_stamps(path, count, step_ns):
 def test_malformed_messages_cost_neither_the_node_nor_a_good_frame(listener, capsys):
     count = 10_000 if FULL else 300
     topics = ["raw", "packed/compressed"]
-    reliable = {f"qos_overrides./{t}.subscription.{k}": v for t in topics for k, v in (("reliability", "reliable"),
+    delivery = {f"qos_overrides./{t}.subscription.{k}": v for t in topics for k, v in (("reliability", "reliable"),
                                                                                       ("depth", 1000))}  # fmt: skip
-    with running_node(image_topics=topics, **STILL, **reliable) as node:
+    with running_node(image_topics=topics, **STILL, **delivery) as node:
         health = Health(listener)
         camera = Process(sys.executable, "-m", "test.ros.malform", "--count", str(count))
         time.sleep(5)
@@ -118,15 +118,15 @@ def test_a_publisher_that_dies_and_comes_back_is_heard_again(listener, tmp_path)
     with running_node(no_image_warning_s=1.0, **STILL) as node:
         health = Health(listener)
         camera = publisher("--stamps", first)
-        wait_until(lambda: health.count("frames processed") > 2, 30, "frames")
+        wait_until(lambda: health.count("frames processed") > 2, 60, "frames")
         camera.end(signal.SIGKILL)
-        node.wait_for("no image for", 10)
+        node.wait_for("no image for", 60)
         before = health.count("frames processed")
         second = tmp_path / "second.csv"
         second.write_text("".join(f"{at(1000 + i)},\n" for i in range(100)))
         camera = publisher("--stamps", str(second))
-        node.wait_for("images come on camera/image_raw", 20)
-        wait_until(lambda: health.count("frames processed") > before, 20, "frames again")
+        node.wait_for("images come on camera/image_raw", 60)
+        wait_until(lambda: health.count("frames processed") > before, 60, "frames again")
         camera.end(signal.SIGKILL)
         assert node.end() == 0
 
@@ -160,11 +160,11 @@ def test_a_full_disk_while_saving_is_told_and_frames_go_on(listener, tmp_path):
         answer = trigger(listener, "save")
         assert not answer.success
         assert "cannot save" in answer.message
-        wait_until(lambda: health.status.level == b"\x02", 30, "an error on /diagnostics")
+        wait_until(lambda: health.status.level == b"\x02", 60, "an error on /diagnostics")
         assert health.status.message.startswith("autosave: cannot save")
         resource.prlimit(node.child.pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         assert trigger(listener, "save").message.startswith(f"saved {tmp_path / 'map'}: 3 keyframes")
-        wait_until(lambda: health.status.level == b"\x00", 30, "diagnostics without an error")
+        wait_until(lambda: health.status.level == b"\x00", 60, "diagnostics without an error")
         assert node.end() == 0
 
 
@@ -230,7 +230,7 @@ def test_a_node_killed_in_the_middle_of_saving_starts_again_with_its_map(listene
             health = Health(listener)
             camera = Camera(listener, health, "camera/image_raw")
             camera.send(image(scene(turn), at(turn)))
-            node.wait_for(f"{known + 1} keyframes, 1 new", 30)
+            node.wait_for(f"{known + 1} keyframes, 1 new", 60)
             known += 1
             node.child.send_signal(signal.SIGKILL)
             node.wait()

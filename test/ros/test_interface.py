@@ -26,7 +26,7 @@ def idle(domain):
 def test_the_interface_page_names_every_topic_and_service_of_the_node(idle, listener):
     page = (ROOT / "docs" / "ros_interface.md").read_text()
     graph = listener.node
-    wait_until(lambda: ("place_recognizer", "/") in graph.get_node_names_and_namespaces(), 10, "the node")
+    wait_until(lambda: ("place_recognizer", "/") in graph.get_node_names_and_namespaces(), 60, "the node")
     own = {"/parameter_events", "/rosout", f"{NODE}/transition_event"}
     topics = dict(graph.get_publisher_names_and_types_by_node("place_recognizer", "/"))
     services = dict(graph.get_service_names_and_types_by_node("place_recognizer", "/"))
@@ -47,9 +47,9 @@ def test_the_start_up_block_says_what_runs(idle):
 
 def test_a_topic_that_never_publishes_is_reported_with_its_qos(idle, listener):
     words = "on /camera/image_raw (Image, best effort, volatile): nobody publishes it"
-    assert "no image for" in idle.wait_for(words, 10)
+    assert "no image for" in idle.wait_for(words, 60)
     assert "nobody publishes it" in wait_until(
-        lambda: (s := Health(listener).status).level == b"\x01" and s.message, 10, "a warning"
+        lambda: (s := Health(listener).status).level == b"\x01" and s.message, 60, "a warning"
     )
 
 
@@ -60,7 +60,7 @@ def test_live_parameters_change_together_or_not_at_all(idle, listener):
     assert not refusal.successful
     assert "candidates" in refusal.reason
     assert (number(listener, "accept_score"), number(listener, "candidates")) == (0.7, 5)
-    wait_until(lambda: Health(listener).values()["accept_score"] == "0.700", 10, "the new threshold in use")
+    wait_until(lambda: Health(listener).values()["accept_score"] == "0.700", 60, "the new threshold in use")
     assert set_together(listener, accept_score=0.5, candidates=10).successful
 
 
@@ -101,5 +101,5 @@ def test_services_answer_with_what_they_did(idle, listener):
     assert trigger(listener, "reset").message == "forgot 0 keyframes"
     pause = listener.call(SetBool, f"{NODE}/pause", SetBool.Request(data=True))
     assert pause.success
-    wait_until(lambda: Health(listener).status.message == "paused", 10, "paused")
+    wait_until(lambda: Health(listener).status.message == "paused", 60, "paused")
     assert listener.call(SetBool, f"{NODE}/pause", SetBool.Request(data=False)).message == "running"

@@ -18,13 +18,13 @@ from msg_adapters.loop_closures import closures_from_message
 from pnv_core.types import Reason
 from pnv_ros.markers import MARKERS_QOS
 from pnv_ros.outputs import CLOSURES_QOS
-from test.ros.camera import EPOCH_S, Camera, Health, compressed, image, scene
+from test.ros.camera import EPOCH_S, Camera, Health, compressed, image, reliable, scene
 from test.ros.controls import set_together, state, transition, trigger
 from test.ros.processes import NODE, Process, executable, ros_arguments, running_node, wait_until
 from test.ros.tables import rows_of
 
 pytestmark = pytest.mark.process
-EAGER = {"min_interval_s": 0.0, "min_change": 0.0, "consistency": 0}
+EAGER = {"min_interval_s": 0.0, "min_change": 0.0, "consistency": 0} | reliable("camera/image_raw", "front", "rear")
 
 
 def at(seconds, nanoseconds=0):
@@ -85,7 +85,7 @@ def test_a_place_seen_again_is_closed_shown_and_told_to_every_listener(domain, l
     pairs = listener.collect(Float64MultiArray, f"{NODE}/lio_sam")
     with running_node(image_topics=["front", "rear"], accept_score=0.0, **EAGER) as node:
         rear = Camera(listener, health, "rear", CompressedImage)
-        node.wait_for("now listening to /rear (CompressedImage", 30)
+        node.wait_for("now listening to /rear (CompressedImage", 60)
         front = Camera(listener, health, "front")
         for place in range(3):
             front.send(image(scene(place), at(place, 7)))
@@ -96,16 +96,16 @@ def test_a_place_seen_again_is_closed_shown_and_told_to_every_listener(domain, l
         rear.send(compressed(scene(1), at(60, 999_999_999)))
         late = listener.collect(Float64MultiArray, "/loop_closures", CLOSURES_QOS)  # transient local
 
-        closure = closures_from_message(wait_until(lambda: late, 20, "the closure")[0], ["front", "rear"])[0]
+        closure = closures_from_message(wait_until(lambda: late, 60, "the closure")[0], ["front", "rear"])[0]
         assert (closure.query.stamp_ns, closure.query.camera) == (at(60, 999_999_999), "rear")
         assert (closure.match.stamp_ns, closure.match.camera) == (at(1, 7), "front")
-        assert np.allclose(wait_until(lambda: pairs, 10, "lio_sam")[0].data, [EPOCH_S + 61.0, EPOCH_S + 1.0])
-        best = rows_of(wait_until(lambda: tables, 10, "candidates")[0])[0]
+        assert np.allclose(wait_until(lambda: pairs, 60, "lio_sam")[0].data, [EPOCH_S + 61.0, EPOCH_S + 1.0])
+        best = rows_of(wait_until(lambda: tables, 60, "candidates")[0])[0]
         assert (best["query_camera"], best["match_camera"], best["accepted"]) == (1, 0, 1)
-        picture = wait_until(lambda: pictures, 10, "match image")[0]
+        picture = wait_until(lambda: pictures, 60, "match image")[0]
         assert picture.encoding == "rgb8"
         assert np.asarray(picture.data).std() > 20
-        newest = wait_until(lambda: markers and markers[-1].markers[1].points and markers[-1], 10, "markers")
+        newest = wait_until(lambda: markers and markers[-1].markers[1].points and markers[-1], 60, "markers")
         assert len(newest.markers[0].points) == 4
         assert health.count("keyframes") == 4
         assert health.count("dropped: stamp_repeated") == health.count("dropped: stamp_back") == 1
@@ -123,7 +123,7 @@ def test_a_bag_in_a_loop_closes_against_its_own_first_run(domain, listener):
             if place == 2:
                 camera.send(image(scene(2), at(1, 5 * 10**8)))  # late by half a second: skipped, no new run
         node.wait_for("went back by 1.000 s to 1700000001.000000000: a new session begins")
-        first = closures_from_message(wait_until(lambda: closures, 10, "a closure")[0])[0]
+        first = closures_from_message(wait_until(lambda: closures, 60, "a closure")[0])[0]
         assert (first.query.stamp_ns, first.match.stamp_ns, first.query.id) == (at(1), at(1), 2)
         assert node.end() == 0
 
@@ -146,7 +146,7 @@ def test_a_node_restarted_with_its_map_recognises_yesterdays_places(domain, list
         node.wait_for("loaded 4 keyframes")
         again = Camera(listener, Health(listener), "camera/image_raw")
         again.send(image(scene(4), at(90_000)))
-        found = closures_from_message(wait_until(lambda: closures, 20, "a closure")[0])[0]
+        found = closures_from_message(wait_until(lambda: closures, 60, "a closure")[0])[0]
         assert (found.match.stamp_ns, found.match.id, found.query.id) == (at(4), 3, 4)
         assert trigger(listener, "load").success  # back to what was saved
         node.child.send_signal(signal.SIGKILL)
@@ -157,7 +157,7 @@ def test_a_node_restarted_with_its_map_recognises_yesterdays_places(domain, list
         health = Health(listener)
         localised = Camera(listener, health, "camera/image_raw")
         localised.send(image(scene(2), at(190_000)))
-        found = closures_from_message(wait_until(lambda: closures, 20, "a closure")[0])[0]
+        found = closures_from_message(wait_until(lambda: closures, 60, "a closure")[0])[0]
         assert (found.match.stamp_ns, found.query.id) == (at(2), -1)
         assert health.count("keyframes") == 4
         assert node.end() == 0
@@ -171,7 +171,7 @@ def test_an_incompatible_publisher_is_reported_with_both_profiles_and_the_remedy
     with running_node(**{override: "reliable"}) as node:
         best_effort = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         listener.node.create_publisher(Image, "/camera/image_raw", best_effort)
-        line = node.wait_for("no images from listener on /camera/image_raw", 20)
+        line = node.wait_for("no images from listener on /camera/image_raw", 60)
         assert "it offers best effort, volatile, this node asks for reliable, volatile" in line
         assert line.endswith(f"set {override} to best effort")
         assert node.end() == 0
@@ -188,7 +188,7 @@ def test_mask_crop_and_camera_info_shape_what_is_looked_at(domain, listener, tmp
         camera.send(image(scene(1), at(0)))
         node.wait_for("frames of camera/image_raw wait for its camera info")
         infos = listener.node.create_publisher(CameraInfo, "camera_info", 1)
-        wait_until(infos.get_subscription_count, 10, "camera info")
+        wait_until(infos.get_subscription_count, 60, "camera info")
         k = [300.0, 0.0, 160.0, 0.0, 300.0, 120.0, 0.0, 0.0, 1.0]
         d = [-0.2, 0.05, 0.0, 0.0, 0.0]
         infos.publish(CameraInfo(width=320, height=240, distortion_model="plumb_bob", d=d, k=k))
@@ -208,16 +208,16 @@ def test_odometry_rules_out_a_closure_and_places_the_keyframes(domain, listener)
     with running_node(odometry_topic="odom", accept_score=0.0, **EAGER) as node:
         camera = Camera(listener, health, "camera/image_raw")
         odometry = listener.node.create_publisher(Odometry, "odom", 10)
-        wait_until(odometry.get_subscription_count, 10, "odometry")
+        wait_until(odometry.get_subscription_count, 60, "odometry")
         for seconds, x in ((0, 0.0), (60, 10_000.0)):
             sample = Odometry()
             sample.header.stamp.sec, sample.header.frame_id, sample.pose.pose.position.x = EPOCH_S + seconds, "odom", x
             odometry.publish(sample)
             time.sleep(0.5)
             camera.send(image(scene(1), at(seconds)))
-        best = rows_of(wait_until(lambda: tables, 20, "candidates")[0])[0]
+        best = rows_of(wait_until(lambda: tables, 60, "candidates")[0])[0]
         assert (best["accepted"], best["reason"]) == (0, list(Reason).index(Reason.ODOMETRY))
-        newest = wait_until(lambda: markers and len(markers[-1].markers[0].points) == 2 and markers[-1], 10, "markers")
+        newest = wait_until(lambda: markers and len(markers[-1].markers[0].points) == 2 and markers[-1], 60, "markers")
         assert [p.x for p in newest.markers[0].points] == [0.0, 10_000.0]
         assert newest.markers[0].header.frame_id == "odom"
         assert node.end() == 0
@@ -236,7 +236,7 @@ def test_a_worker_that_fails_ends_the_process_with_its_traceback(domain, listene
     assert node.wait() == 1
     assert "ZeroDivisionError: division by zero" in node.output
     assert "Traceback" in node.output
-    wait_until(lambda: health.status.level == b"\x02", 10, "the last word on /diagnostics")
+    wait_until(lambda: health.status.level == b"\x02", 60, "the last word on /diagnostics")
 
 
 def test_two_nodes_with_namespaces_do_not_hear_each_other(domain, listener):
@@ -246,7 +246,7 @@ def test_two_nodes_with_namespaces_do_not_hear_each_other(domain, listener):
             camera = Camera(listener, Health(listener, "/a/place_recognizer"), "/a/camera/image_raw")
             for seconds in (0, 60):
                 camera.send(image(scene(1), at(seconds)))
-            wait_until(lambda: heard["a"], 20, "a closure")
+            wait_until(lambda: heard["a"], 60, "a closure")
             time.sleep(0.5)
             assert not heard["b"]
             assert two.end() == 0
