@@ -131,7 +131,7 @@ def main() -> int:
         known = {"map_path": str(Path(scratch) / "map"), "load_on_start": True, "read_only": True, "min_texture": 0.0}
         with running_node(**(every_frame | known | parameters)) as node:
             driver = subprocess.Popen(camera)
-            wait_until(lambda: taken, 60, "the first closure")
+            wait_until(lambda: taken or node.child.poll() is not None, 60, "the first closure")
             start, first, cpu = time.monotonic(), len(taken), node.cpu_s()
             driver.wait(args.seconds + 60)
             seconds = time.monotonic() - start - 1.0  # the camera lingers for a second
