@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from pnv_cli.common import add_config_flags, config_from, writable
 from pnv_cli.sources import FrameSource, bag, image_folder, video
+from pnv_core.calibration import CONSERVATIVE
 from pnv_core.describer import describer_from
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.files import atomic_write
@@ -66,6 +67,8 @@ def run(args: argparse.Namespace) -> int:
     source = _source(args)
     timer = StageTimer(time.perf_counter)
     recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
+    if recognizer.judge.calibration is CONSERVATIVE:
+        print("pnv: no calibration fits this model and these settings: a conservative score decides", file=sys.stderr)
     recorder = _recorder(recognizer) if report else None
     names: Names = {}
     rows: list[dict] = []
