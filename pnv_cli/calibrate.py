@@ -3,7 +3,7 @@
 import argparse
 
 from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_cli.sources import FrameSource, bag, image_folder, video
+from pnv_cli.sources import add_source_flags, source_of
 from pnv_core.calibrating import (
     calibrated,
     cross_checked,
@@ -29,13 +29,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
         "another.",
         allow_abbrev=False,
     )
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--images", metavar="DIR", help="images in name order")
-    source.add_argument("--video", metavar="FILE")
-    source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")
-    parser.add_argument("--topic", help="image topic of the bag; default all image topics")
-    parser.add_argument("--fps", type=float, default=10.0, help="stamps of --images; default 10")
-    parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
+    add_source_flags(parser)
     truth = parser.add_mutually_exclusive_group()
     truth.add_argument("--poses", metavar="CSV", help="columns frame,x,y and, if known, z, yaw (radians)")
     truth.add_argument("--matches", metavar="CSV", help="columns query,true_refs; references separated by ;")
@@ -65,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         truth = truth_of_time(args.near_s, args.far_s)
     # from time, the neighbours are what is true: they must be candidates
     recent_s = 0.0 if by_time else describer.config.exclude_recent_s
-    found = gathered(describer, _source(args).frames, truth, recent_s)
+    found = gathered(describer, source_of(args).frames, truth, recent_s)
     if by_time:
         found = without_unlabelled_loops(found)
     true, false = int(found.true.sum()), int((~found.true).sum())
@@ -88,11 +82,3 @@ def run(args: argparse.Namespace) -> int:
         reached = f"--accept-score {threshold:.3f}" if threshold <= 1 else "no threshold"
         print(f"precision {args.precision:g} of single candidates: {reached}")
     return 0
-
-
-def _source(args: argparse.Namespace) -> FrameSource:
-    if not 0.001 <= args.fps <= 10000:
-        raise ConfigError(f"--fps {args.fps}; allowed: 0.001 to 10000")
-    if args.images:
-        return image_folder(args.images, args.fps, args.timestamps)
-    return video(args.video) if args.video else bag(args.bag, args.topic)

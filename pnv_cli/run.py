@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from tqdm import tqdm
 
 from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_cli.sources import FrameSource, bag, image_folder, video
+from pnv_cli.sources import add_source_flags, source_of
 from pnv_core.calibration import CONSERVATIVE
 from pnv_core.describer import describer_from
 from pnv_core.errors import ConfigError, PnvError
@@ -42,13 +42,7 @@ Names = dict[tuple[str, int], str]  # of a frame, by camera and stamp
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser = subparsers.add_parser("run", help="loop closures of a sequence", allow_abbrev=False)
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--images", metavar="DIR", help="images in name order")
-    source.add_argument("--video", metavar="FILE")
-    source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")
-    parser.add_argument("--topic", help="image topic of the bag; default all image topics")
-    parser.add_argument("--fps", type=float, default=10.0, help="stamps of --images; default 10")
-    parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
+    add_source_flags(parser)
     parser.add_argument("--csv", required=True, metavar="OUT.csv", help="one row per accepted closure")
     parser.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
     parser.add_argument("--report", metavar="FILE.html", help="scores, pictures and path of the run as one page")
@@ -64,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if args.poses and not report:
         raise ConfigError("--poses is shown in the report; allowed: together with --report FILE.html")
     config = config_from(args)
-    source = _source(args)
+    source = source_of(args)
     timer = StageTimer(time.perf_counter)
     recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
     if recognizer.judge.calibration is CONSERVATIVE:
@@ -112,14 +106,6 @@ def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespac
         file.write(recorder.html([("Input", taken)], positions).encode())
     recorder.close()
     print(f"report: {target}")
-
-
-def _source(args: argparse.Namespace) -> FrameSource:
-    if not 0.001 <= args.fps <= 10000:
-        raise ConfigError(f"--fps {args.fps}; allowed: 0.001 to 10000")
-    if args.images:
-        return image_folder(args.images, args.fps, args.timestamps)
-    return video(args.video) if args.video else bag(args.bag, args.topic)
 
 
 def _reported(closures: list[LoopClosure], best_of_every_query: bool) -> Iterator[LoopClosure]:

@@ -1,5 +1,6 @@
 """Where frames come from: a folder of images, a video, a rosbag2. Each gives (name, Frame) in order."""
 
+import argparse
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -9,7 +10,7 @@ from pathlib import Path
 import cv2
 
 from msg_adapters.images import message_to_frame
-from pnv_core.errors import ImageError, PnvError
+from pnv_core.errors import ConfigError, ImageError, PnvError
 from pnv_core.evaluation.datasets.tables import rows
 from pnv_core.images import list_images, read_image
 from pnv_core.types import Frame
@@ -23,6 +24,26 @@ class FrameSource:
 
     count: int
     frames: Iterator[tuple[str, Frame]]
+
+
+def add_source_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags that `source_of` reads."""
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--images", metavar="DIR", help="images in name order")
+    source.add_argument("--video", metavar="FILE")
+    source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")
+    parser.add_argument("--topic", help="image topic of the bag; default all image topics")
+    parser.add_argument("--fps", type=float, default=10.0, help="stamps of --images; default 10")
+    parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
+
+
+def source_of(args: argparse.Namespace) -> FrameSource:
+    """The source that the flags name. Raises PnvError for one that cannot be read."""
+    if not 0.001 <= args.fps <= 10000:
+        raise ConfigError(f"--fps {args.fps}; allowed: 0.001 to 10000")
+    if args.images:
+        return image_folder(args.images, args.fps, args.timestamps)
+    return video(args.video) if args.video else bag(args.bag, args.topic)
 
 
 def image_folder(folder: str, fps: float, timestamps: str | None) -> FrameSource:
