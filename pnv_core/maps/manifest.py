@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pnv_core.errors import MapError
+from pnv_core.files import sync_folder
 
 NAME = "map.json"
 FORMAT, VERSION = "pnv_map", 1
@@ -123,11 +124,3 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     sync_folder(folder)  # the segments' names first
     os.replace(aside, folder / NAME)
     sync_folder(folder)
-
-
-def sync_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
