@@ -60,7 +60,7 @@ setup(
     license="MIT",
     python_requires=">=3.11",
     packages=find_packages(include=["pnv_core*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
-    package_data={"pnv_core": ["models/*"], "pnv_cli": ["*.html"]},
+    package_data={"pnv_core": ["models/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

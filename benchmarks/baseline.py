@@ -48,18 +48,6 @@ def patch_descriptors(
     return out
 
 
-def global_descriptor(
-    features: Tensor, assignment: Tensor, centroids: Tensor, projection: Tensor, bias: Tensor
-) -> Tensor:
-    """The whole image: (D,)."""
-    k, c = centroids.shape
-    x = F.normalize(features, dim=1)
-    weights = F.softmax(F.conv2d(x, assignment[:, :, None, None]).view(1, k, -1), dim=1)
-    residuals = (x.view(1, 1, c, -1) - centroids[None, :, :, None]) * weights[:, :, None]
-    vlad = F.normalize(F.normalize(residuals.sum(-1), dim=2).view(1, -1), dim=1)
-    return F.normalize(F.conv2d(vlad[:, :, None, None], projection[:, :, None, None], bias).flatten(1), dim=1)[0]
-
-
 def mutual_matches(query: Tensor, reference: Tensor) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """(D, n_q), (D, n_r) unit columns -> matched patch numbers (query, reference)."""
     distance = torch.sqrt(2 - 2 * (query.T @ reference) + 1e-9)

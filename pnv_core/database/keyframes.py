@@ -83,10 +83,6 @@ class DatabaseStats:
     sessions: int
     disk_bytes: int = 0
 
-    @property
-    def bytes_free(self) -> int:
-        return self.bytes_budget - self.bytes_used
-
 
 class KeyframeRecord(Protocol):
     """A keyframe that can be saved or restored: one of the database, or one read from a map."""
