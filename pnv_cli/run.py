@@ -86,8 +86,8 @@ def run(args: argparse.Namespace) -> int:
     accepted = sum(row["accepted"] for row in rows)
     print(f"{done} frames, {len(recognizer.database)} keyframes, {accepted} closures -> {output}")
     if args.timing:
-        for stage, (median, late) in timer.summary_ms().items():
-            print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms")
+        for stage, (median, late, latest) in timer.summary_ms().items():
+            print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms   99 % {latest:7.1f} ms")
     return 0
 
 

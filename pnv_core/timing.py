@@ -29,11 +29,12 @@ class StageTimer:
         finally:
             self.durations.setdefault(name, deque(maxlen=_KEPT)).append(self.clock() - start)
 
-    def summary_ms(self) -> dict[str, tuple[float, float]]:
-        """Per stage the median and 95th percentile in milliseconds of the latest calls."""
+    def summary_ms(self) -> dict[str, tuple[float, float, float]]:
+        """Per stage the median, 95th and 99th percentile in milliseconds of the latest calls."""
+        kept = ((name, 1e3 * np.array(list(durations))) for name, durations in list(self.durations.items()))
         return {
-            name: (float(np.percentile(d, 50)) * 1e3, float(np.percentile(d, 95)) * 1e3)
-            for name, d in ((n, list(v)) for n, v in list(self.durations.items()))
+            name: (float(np.percentile(ms, 50)), float(np.percentile(ms, 95)), float(np.percentile(ms, 99)))
+            for name, ms in kept
         }
 
 

@@ -92,7 +92,7 @@ class Diagnostics:
             "last autosave": self._statistics.autosave_failure or "no failure",
             "closures": str(self._statistics.closures),
             "last closure": self._statistics.last_closure or "none",
-            **{f"{stage} p50, p95 [ms]": f"{p50:.1f}, {p95:.1f}" for stage, (p50, p95) in stages.items()},
+            **{f"{s} p50, p95, p99 [ms]": ", ".join(f"{p:.2f}" for p in late) for s, late in stages.items()},
         }
 
     def _log_silence(self, now: float, silent: dict[str, float], inputs: ImageInputs) -> None:

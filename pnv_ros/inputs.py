@@ -10,6 +10,7 @@ from rclpy.qos import QoSPolicyKind, QoSProfile, qos_policy_name_from_kind, qos_
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image
 
+from pnv_core.timing import StageTimer
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.slot import NewestFrames, WaitingFrame
 from pnv_ros.stamps import StampRule, StampVerdict, in_seconds
@@ -47,10 +48,16 @@ class ImageInputs:
     """One subscription per camera; callbacks take microseconds since messages stay packed until they are used."""
 
     def __init__(
-        self, node: Node, config: NodeConfig, frames: NewestFrames, statistics: Statistics, stamps: StampRule
+        self,
+        node: Node,
+        config: NodeConfig,
+        frames: NewestFrames,
+        statistics: Statistics,
+        stamps: StampRule,
+        timer: StageTimer,
     ) -> None:
         self._node, self._config, self._frames = node, config, frames
-        self._statistics, self._stamps = statistics, stamps
+        self._statistics, self._stamps, self._timer = statistics, stamps, timer
         self.paused = False
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
@@ -119,6 +126,10 @@ class ImageInputs:
 
     def _callback(self, topic: str, message_type: type) -> Callable[[bytes], None]:
         def receive(serialized: bytes) -> None:
+            with self._timer.stage("receive"):
+                take(serialized)
+
+        def take(serialized: bytes) -> None:
             self._statistics.receive(topic)
             if self.paused:
                 self._statistics.drop(Drop.PAUSED)

@@ -208,7 +208,8 @@ class PlaceRecognizerNode(LifecycleNode):
         assert self._diagnostics is not None
         frames = NewestFrames()
         self._diagnostics.forget()
-        self._inputs = ImageInputs(self, self.settings.node, frames, self._statistics, self._stamps)
+        timer = self._recognition.recognizer.timer
+        self._inputs = ImageInputs(self, self.settings.node, frames, self._statistics, self._stamps, timer)
         self._worker = Worker(frames, self._recognition.work, self._failed)
         self._worker.start()
         topics = "\n".join(f"  listens to   {self._inputs.describe(t)}" for t in self.settings.node.image_topics)

@@ -1,5 +1,6 @@
 """A small random model, so that tests need no trained weights: RootSIFT trunk, K = 4 clusters, D = 32 dimensions."""
 
+import numpy as np
 import torch
 
 from pnv_core.config import Config
@@ -28,3 +29,9 @@ def small_model(seed: int = 0, clusters: int = 4, dim: int = 32) -> Model:
 
 def small_describer(**settings: object) -> Describer:
     return Describer(small_model(), Config.make(**settings))
+
+
+def noise_image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    coarse = rng.integers(0, 256, (height // 8, width // 8, 3), dtype=np.uint8)
+    return np.repeat(np.repeat(coarse, 8, 0), 8, 1)

@@ -12,13 +12,7 @@ from pnv_core.patches import patch_descriptors, window_sums
 from pnv_core.reranker import Reranker
 from pnv_core.spatial import ransac_score, rapid_spatial_score
 from pnv_core.types import PatchGrid
-from test.core.small import HEIGHT, WIDTH, small_describer
-
-
-def noise_image(seed: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    coarse = rng.integers(0, 256, (height // 8, width // 8, 3), dtype=np.uint8)
-    return np.repeat(np.repeat(coarse, 8, 0), 8, 1)
+from test.core.small import HEIGHT, WIDTH, noise_image, small_describer
 
 
 @given(h=st.integers(1, 12), w=st.integers(1, 12), size=st.integers(1, 12), seed=st.integers(0, 99))
