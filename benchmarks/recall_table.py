@@ -17,14 +17,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.describer import Describer, describer_from, resized
 from pnv_core.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
 from pnv_core.model_files import make_trunk
-from pnv_core.netvlad import NetVLAD
+from pnv_core.netvlad import NetVLAD, gem
 from pnv_core.reranker import Reranker
 from pnv_core.training.initial import imagenet_trunk
 from pnv_core.training.sources import is_held, load_set
@@ -128,11 +127,6 @@ def baseline_vectors(trunk: Trunk, heads: dict[str, Head], images: Sequence[Path
 
 def pixels(image: Path | Pixels, size: tuple[int, int]) -> Pixels:
     return read_rgb(image, *size) if isinstance(image, Path) else resized(image, *size)
-
-
-def gem(features: torch.Tensor) -> torch.Tensor:
-    """Generalised mean, p = 3 (Radenovic et al., TPAMI 2018)."""
-    return F.normalize(features.clamp(min=1e-6).pow(3).mean((2, 3)).pow(1 / 3), dim=1)
 
 
 def fitted(trunk: Trunk, files: Sequence[Path]) -> NetVLAD:

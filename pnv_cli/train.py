@@ -14,6 +14,8 @@ from tqdm import tqdm
 from pnv_cli.common import writable
 from pnv_core.errors import ConfigError
 
+FIRES = 6  # where the compact trunk is cut: what two more Fire modules add is tuned to ImageNet's classes
+
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("train", help="train a model for places (hours on a CPU, minutes with --pool)")
@@ -41,9 +43,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--clusters", type=int, default=16, help="K (default 16)")
     parser.add_argument("--neck", type=int, default=128, help="channels after the compact trunk (default 128)")
     parser.add_argument("--global-dim", type=int, default=512)
+    parser.add_argument("--pooled-dim", type=int, default=192, help="of --global-dim, for the pooled features")
     parser.add_argument("--patch-dim", type=int, default=128)
-    parser.add_argument("--size", default="320x240", help="input size of the compact model (default 320x240)")
-    parser.add_argument("--view", default="256x192", help="size of the views it is trained on (default 256x192)")
+    parser.add_argument("--size", default="384x288", help="input size of the compact model (default 384x288)")
+    parser.add_argument("--view", default="320x240", help="size of the views it is trained on (default 320x240)")
     parser.add_argument("--places", type=int, default=40, help="places a batch (default 40)")
     parser.add_argument("--views", type=int, default=3, help="views a place (default 3)")
     parser.add_argument(
@@ -82,7 +85,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     options = _options(TrainOptions, args.set, **given)
     size, view = _size(args.size), _size(args.view)
     trained, held = _split(args.data)
-    trunk = imagenet_trunk(args.imagenet, fires=8, relu=True)
+    trunk = imagenet_trunk(args.imagenet, fires=FIRES, relu=True)
     layers = options.frozen_layers
     # the pool draws four views a place; a training batch takes some of them
     drawn = BatchOptions(places=20, views=4, neighbours=4, sizes=(view,), seed=options.seed + 7)
@@ -91,13 +94,19 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     pool.build(trunk, layers, tqdm(range(pool.groups), desc="views", unit="group"))
     info = ModelInfo(
         "compact",
-        {"fires": 8, "neck": args.neck, "relu": True},
+        {"fires": FIRES, "neck": args.neck, "relu": True},
         *size,
         patch_sizes=(1, 2),  # with their weights: grid search on held-out training places and the development sets
         patch_weights=(0.6, 0.4),
         provenance=f"pnv train, seed {options.seed}, {options.steps} steps on {len(trained)} images; see MODEL_CARD.md",
     )
-    fit = FitOptions(clusters=args.clusters, global_dim=args.global_dim, patch_dim=args.patch_dim, patches_per_image=12)
+    fit = FitOptions(
+        clusters=args.clusters,
+        global_dim=args.global_dim,
+        pooled_dim=args.pooled_dim,
+        patch_dim=args.patch_dim,
+        patches_per_image=12,
+    )
     model = initial_model(trunk, args.neck, pool.mild_maps, layers, info, fit)
     fresh = BatchOptions(places=args.places, views=args.views, sizes=(view,), seed=options.seed)
     batches = pool if args.pool else PlaceBatches(trained, fresh)

@@ -54,6 +54,11 @@ class CompactTrunk(Trunk):
         self.features = nn.Sequential(*layers)
         self.neck = nn.Conv2d(width, neck, 1) if neck else nn.Identity()
         self.channels = neck or width
+        self._width = width
+
+    @property
+    def width(self) -> int:
+        return self._width
 
     def front(self, images: Tensor, layers: int) -> Tensor:
         """(B, 3, H, W) -> what the first `layers` of `features` give."""
@@ -61,13 +66,13 @@ class CompactTrunk(Trunk):
         x = self.input(images[:, :, :height, :width])
         return self.features[:layers](F.pad(x, (0, 1, 0, 1)))
 
-    def back(self, maps: Tensor, layers: int) -> Tensor:
-        """The rest after `front` with as many layers: -> (B, C, h, w)."""
-        return self.neck(self.features[layers:](maps))
+    def back(self, maps: Tensor, layers: int) -> tuple[Tensor, Tensor]:
+        """The rest after `front` with as many layers, as `maps` gives it."""
+        wide = self.features[layers:](maps)
+        return self.neck(wide), wide
 
-    def backbone(self, images: Tensor) -> Tensor:
-        """(B, 3, H, W) -> (B, width, h, w), before the neck."""
-        return self.front(images, len(self.features))
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        return self.back(self.front(images, len(self.features)), len(self.features))
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.neck(self.backbone(images))
+        return self.maps(images)[0]

@@ -9,7 +9,12 @@ from pnv_core.settings import checked, setting, settings_of
 
 # What a preset sets when the user does not: patch geometry, scorer, input size and the file taken when none is named.
 # performance, speed and storage are the published configurations (Patch-NetVLAD repository, configs/*.ini).
-_PUBLISHED: dict[str, Any] = {"image_width": 640, "image_height": 480, "patch_precision": "float32"}
+_PUBLISHED: dict[str, Any] = {
+    "image_width": 640,
+    "image_height": 480,
+    "patch_precision": "float32",
+    "scale_weight": 0.0,
+}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "performance": _PUBLISHED
@@ -91,6 +96,12 @@ class Config:
 
     # Re-ranking
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
+    scale_weight: float = setting(
+        0.3,
+        "share of its RANSAC score that a candidate seen from nearer or farther loses at most; 0 = the paper's score",
+        low=0.0,
+        high=1.0,
+    )
     match_mode: str = setting(
         "exact",
         "exact: score every candidate; bounded: none that provably cannot be best; coarse: none that hardly can",

@@ -54,7 +54,13 @@ class Describer:
         self.config = _completed(config or Config(), model)
         self.device = _device(self.config.device)
         self.model = model
-        for module in (model.trunk, model.netvlad, model.global_projection, model.patch_projection):
+        for module in (
+            model.trunk,
+            model.netvlad,
+            model.global_projection,
+            model.patch_projection,
+            model.pooled_projection,
+        ):
             if module is not None:
                 module.to(self.device)
         self.trunk = _running(model.trunk, self.config.trunk_precision)
@@ -96,11 +102,13 @@ class Describer:
         """
         pixels = resized(checked_image(rgb), *self.image_size)
         with torch.inference_mode():
-            features = self.features(pixels)
+            features, wide = self.maps(pixels)
             x, weights = self.model.netvlad.soft_assign(features)
+            cells = None
             if valid is not None:
-                weights = weights * torch.from_numpy(_valid_cells(valid, features.shape[-2:])).to(weights)
-            vector = self.model.global_projection(self.model.netvlad.vlad(x, weights))[0]
+                cells = torch.from_numpy(_valid_cells(valid, features.shape[-2:])).to(weights)
+                weights, cells = weights * cells, cells[0]
+            vector = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide, cells)[0]
             arrays = self._patches(x[0], weights[0], (features.shape[-2], features.shape[-1]))
             patches = tuple(
                 PatchGrid(size, rows, cols, array, stride)
@@ -116,10 +124,11 @@ class Describer:
         arrays = patch_descriptors(x, weights, centroids, projection.weight, projection.bias, shape, sizes, strides)
         return [array.cpu().numpy() for array in arrays]
 
-    def features(self, pixels: NDArray[np.uint8]) -> torch.Tensor:
-        """(H, W, 3) uint8 of the configured size -> feature map (1, C, h, w)."""
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[torch.Tensor, torch.Tensor]:
+        """(H, W, 3) uint8 of the configured size -> the trunk's maps (1, C, h, w) and (1, W, h, w)."""
         images = torch.from_numpy(pixels).to(self.device).permute(2, 0, 1)[None].float() / 255.0
-        return self.trunk(images.contiguous(memory_format=torch.channels_last)).float()
+        features, wide = self.trunk.maps(images.contiguous(memory_format=torch.channels_last))
+        return features.float(), wide.float()
 
 
 def _running(trunk: Trunk, precision: str) -> Trunk:

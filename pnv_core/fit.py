@@ -16,7 +16,7 @@ from torch import Tensor
 from pnv_core.describer import resized
 from pnv_core.errors import ModelError
 from pnv_core.model_files import Model, ModelInfo
-from pnv_core.netvlad import NetVLAD, Projection, alpha_rule
+from pnv_core.netvlad import NetVLAD, Projection, alpha_rule, gem
 from pnv_core.patches import patch_vlads
 from pnv_core.trunks import CELL, Trunk
 
@@ -32,6 +32,7 @@ class FitOptions:
 
     clusters: int = 16
     global_dim: int = 512
+    pooled_dim: int = 0  # of them, how many are of the pooled features; 0 = a global vector of the VLAD alone
     patch_dim: int = 128
     image_width: int = 320
     image_height: int = 240
@@ -132,10 +133,16 @@ def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
 
 
 @torch.no_grad()
-def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
-    """The feature map (1, C, h, w) of an image file, on the device of the trunk."""
+def maps_of(trunk: Trunk, path: Path, options: FitOptions) -> tuple[Tensor, Tensor]:
+    """The trunk's maps (1, C, h, w) and (1, W, h, w) of an image file, on the device of the trunk."""
     device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
-    return trunk(as_batch([read_rgb(path, options.image_width, options.image_height)], device)).float()
+    features, wide = trunk.maps(as_batch([read_rgb(path, options.image_width, options.image_height)], device))
+    return features.float(), wide.float()
+
+
+def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
+    """The feature map (1, C, h, w) of an image file."""
+    return maps_of(trunk, path, options)[0]
 
 
 @torch.no_grad()
@@ -176,9 +183,18 @@ def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions
             parts.append(vlads[torch.randperm(len(vlads), generator=generator)[:count]])
     most = len(whole) // SAMPLES_PER_DIMENSION if options.whiten else len(whole) - 1
     return (
-        _projection(*pca(torch.stack(whole), max(1, min(options.global_dim, most)), options.whiten)),
+        _projection(
+            *pca(torch.stack(whole), max(1, min(options.global_dim - options.pooled_dim, most)), options.whiten)
+        ),
         _projection(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
     )
+
+
+@torch.no_grad()
+def pooled_projection_of(maps: Iterable[Tensor], options: FitOptions) -> Projection:
+    """The projection of the generalised means of maps (W, h, w), by PCA."""
+    pooled = torch.cat([gem(m[None].float()) for m in maps])
+    return _projection(*pca(pooled, options.pooled_dim, options.whiten))
 
 
 def fit_vocabulary(
@@ -214,9 +230,14 @@ def adapt_model(model: Model, files: Sequence[Path], progress: Progress = plain_
         raise ModelError(f"{len(files)} images are too few to adapt to; allowed: 8 or more")
     options = FitOptions(image_width=model.info.image_width, image_height=model.info.image_height)
     model.trunk.eval()
-    vlads = [model.netvlad(features_of(model.trunk, file, options).cpu())[0] for file in progress(files, "projection")]
+    vlads, pooled = [], []
+    for file in progress(files, "projection"):
+        features, wide = maps_of(model.trunk, file, options)
+        vlads.append(model.netvlad(features.cpu())[0])
+        pooled.append(gem(wide.cpu())[0])
     whole = adapted_projection(model.global_projection, torch.stack(vlads))
-    return replace(model, global_projection=whole, patch_projection=model.patches_projection)
+    beside = model.pooled_projection and adapted_projection(model.pooled_projection, torch.stack(pooled))
+    return replace(model, global_projection=whole, patch_projection=model.patches_projection, pooled_projection=beside)
 
 
 def fit_model(

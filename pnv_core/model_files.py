@@ -5,6 +5,7 @@ K clusters, C channels, D dimensions.
 
 import hashlib
 import json
+import math
 from dataclasses import asdict, dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from pnv_core.errors import ModelError
 from pnv_core.files import atomic_write
-from pnv_core.netvlad import NetVLAD, Projection
+from pnv_core.netvlad import NetVLAD, Projection, gem
 from pnv_core.trunks import Trunk
 
 FORMAT = "pnv-model-1"
@@ -26,6 +27,9 @@ TRUNKS = {
     "compact": "pnv_core.compact:CompactTrunk",
     "rootsift": "pnv_core.rootsift:RootSIFTTrunk",
 }
+
+
+_OPTIONAL = ("patch_projection", "pooled_projection")
 
 
 @dataclass(frozen=True)
@@ -44,13 +48,29 @@ class ModelInfo:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A describing network. Without `patch_projection` patches share the global one, as in the paper."""
+    """A describing network. Without `patch_projection` patches share the global one, as in the paper.
+
+    With `pooled_projection` the global vector is the projected VLAD beside the projected generalised mean of the map
+    before the trunk's neck, with equal weights: it keeps how strongly features respond, which VLAD's unit local
+    descriptors do not. Without it (every published model) the global vector is the projected VLAD.
+    """
 
     info: ModelInfo
     trunk: Trunk
     netvlad: NetVLAD
     global_projection: Projection
     patch_projection: Projection | None = None
+    pooled_projection: Projection | None = None
+
+    def global_vector(self, vlad: Tensor, wide: Tensor, cells: Tensor | None = None) -> Tensor:
+        """VLADs (B, K * C) and the maps before the trunk's neck (B, W, h, w) -> unit global vectors (B, D).
+
+        `cells` (B, N) say how much each cell counts.
+        """
+        vector: Tensor = self.global_projection(vlad)
+        if self.pooled_projection is None:
+            return vector
+        return torch.cat([vector, self.pooled_projection(gem(wide, cells))], dim=1) * math.sqrt(0.5)
 
     @property
     def patches_projection(self) -> Projection:
@@ -58,7 +78,8 @@ class Model:
 
     @property
     def global_dim(self) -> int:
-        return self.global_projection.weight.shape[0]
+        pooled = 0 if self.pooled_projection is None else self.pooled_projection.weight.shape[0]
+        return self.global_projection.weight.shape[0] + pooled
 
     @property
     def patch_dim(self) -> int:
@@ -67,8 +88,9 @@ class Model:
     def tensors(self) -> dict[str, Tensor]:
         """Every learned tensor by its name in the file."""
         parts = {"trunk": self.trunk, "netvlad": self.netvlad, "global_projection": self.global_projection}
-        if self.patch_projection is not None:
-            parts["patch_projection"] = self.patch_projection
+        for name in _OPTIONAL:
+            if (part := getattr(self, name)) is not None:
+                parts[name] = part
         return {f"{part}.{k}": v.detach() for part, module in parts.items() for k, v in module.state_dict().items()}
 
     def fingerprint(self) -> str:
@@ -98,13 +120,10 @@ def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Mod
     for name, tensor in tensors.items():
         part, _, rest = name.partition(".")
         groups.setdefault(part, {})[rest] = tensor.float()
-    required = {"trunk", "netvlad", "global_projection"}
-    if set(groups) - {"trunk"} not in (
-        {"netvlad", "global_projection"},
-        {"netvlad", "global_projection", "patch_projection"},
-    ):
+    required = {"netvlad", "global_projection"}
+    if set(groups) - {"trunk", *_OPTIONAL} != required:
         raise ModelError(
-            f"{source}: holds the parts {sorted(groups)}; allowed: {sorted(required)} and patch_projection"
+            f"{source}: holds the parts {sorted(groups)}; allowed: trunk, {', '.join(sorted((*required, *_OPTIONAL)))}"
         )
     trunk = make_trunk(info.trunk, info.trunk_options)
     centroids = groups["netvlad"].get("centroids")
@@ -114,15 +133,16 @@ def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Mod
     clusters = centroids.shape[0]
     netvlad = NetVLAD(clusters, trunk.channels)
     projections = {}
-    for part in ("global_projection", "patch_projection"):
+    for part in ("global_projection", *_OPTIONAL):
         if part in groups:
             bias = groups[part].get("bias")
             if bias is None or bias.ndim != 1:
                 raise ModelError(f"{source}: {part}.bias is missing or no vector; allowed: (D,)")
-            projections[part] = Projection(clusters * trunk.channels, bias.shape[0])
+            inputs = trunk.width if part == "pooled_projection" else clusters * trunk.channels
+            projections[part] = Projection(inputs, bias.shape[0])
     for part, module in {"trunk": trunk, "netvlad": netvlad, **projections}.items():
         _load_exactly(module, groups.get(part, {}), f"{source}: {part}")
-    model = Model(info, trunk, netvlad, projections["global_projection"], projections.get("patch_projection"))
+    model = Model(info, trunk, netvlad, **projections)
     for module in (trunk, netvlad, *projections.values()):
         module.eval().requires_grad_(False)
     return model

@@ -45,6 +45,19 @@ def alpha_rule(centroids: Tensor, samples: Tensor) -> Tensor:
     return alpha.to(centroids) * directions
 
 
+def gem(maps: Tensor, weights: Tensor | None = None, power: float = 3.0) -> Tensor:
+    """Generalised mean over cells (Radenovic et al., TPAMI 2018): (B, W, h, w) -> (B, W), unit length.
+
+    `weights` (B, N) say how much each cell counts.
+    """
+    cells = maps.clamp(min=1e-6).pow(power).flatten(2)  # (B, W, N)
+    if weights is None:
+        mean = cells.mean(2)
+    else:
+        mean = (cells * weights[:, None]).sum(2) / weights.sum(1, keepdim=True).clamp(min=1e-6)
+    return F.normalize(mean.clamp(min=1e-18).pow(1 / power), dim=1)
+
+
 class Projection(nn.Module):
     """PCA whitening as a linear map: (..., K * C) -> (..., D), then L2 (Patch-NetVLAD section 3.2)."""
 

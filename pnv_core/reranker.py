@@ -10,7 +10,7 @@ import numpy as np
 from pnv_core.config import Config
 from pnv_core.matching import Indices, PatchRows, mutual_nearest_rows, patch_rows
 from pnv_core.parallel import workers
-from pnv_core.spatial import fused_score, ransac_score, rapid_spatial_score
+from pnv_core.spatial import fused_score, ransac_score, rapid_spatial_score, scale_change
 from pnv_core.types import PatchMatches, PlaceDescriptor
 
 _COARSE_LEAST = 5  # candidates that coarse matching keeps at least
@@ -21,8 +21,9 @@ _COARSE_SIMILARITY = 0.2
 
 @dataclass(frozen=True, eq=False)
 class SpatialResult:
-    """Fused score in [0, 1], the score and mutual matches of each patch size, and how many matches are inliers.
+    """Score in [0, 1], the paper's score and mutual matches of each patch size, and how many matches are inliers.
 
+    `score` is the fusion of `per_size`, less what `Config.scale_weight` takes off where the scale differs.
     With the rapid scorer no match is tested against a homography; `inliers` then counts the mutual matches.
     """
 
@@ -38,6 +39,7 @@ class Reranker:
     def __init__(self, config: Config) -> None:
         self.scorer = config.scorer
         self.weights = config.patch_weights
+        self.scale_weight = config.scale_weight
         self.mode = config.match_mode
         self.keep = config.match_keep
         self.workers = workers(config.threads)
@@ -79,7 +81,10 @@ class Reranker:
             xy = q.keypoints()[pairs[0]], r.keypoints()[pairs[1]]
             found.append(PatchMatches(q.size, pairs[0], pairs[1], inlier, *xy))
         counted = sum(int(m.inlier.sum()) if self.scorer == "ransac" else len(m.query) for m in found)
-        return SpatialResult(fused_score(scores, self.weights), tuple(scores), tuple(found), counted)
+        fused = fused_score(scores, self.weights)
+        if self.scorer == "ransac" and self.scale_weight and fused:
+            fused *= 1.0 - self.scale_weight * scale_change(found)
+        return SpatialResult(fused, tuple(scores), tuple(found), counted)
 
     def _worth_scoring(
         self, query: PlaceDescriptor, rows: Sequence[PatchRows], references: Sequence[PlaceDescriptor]

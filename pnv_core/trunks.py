@@ -14,6 +14,16 @@ class Trunk(nn.Module):
 
     channels: int
 
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The feature map, and the one before the trunk's neck (B, W, h, w); the same where there is no neck."""
+        features = self(images)
+        return features, features
+
+    @property
+    def width(self) -> int:
+        """Channels W before the neck."""
+        return self.channels
+
 
 class _ImageNetInput(nn.Module):
     """Subtracts the ImageNet mean and divides by the standard deviation, per channel."""

@@ -18,9 +18,9 @@ from pnv_core.errors import ConfigError
 from pnv_core.evaluation.extraction import Extractor, Record, descriptor_record
 from pnv_core.evaluation.local_features import LIGHTGLUE_KINDS, lightglue_extractor, sift_record
 from pnv_core.model_files import Model
+from pnv_core.netvlad import gem
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
-GEM_POWER = 3.0  # Radenovic et al., TPAMI 2018; AP-GeM starts from it
 SIFT_BINS_PX = (4, 6, 8, 10)  # the four scales of DenseVLAD (Torii et al., CVPR 2015)
 _TRUNK_BIN_PX = 8  # of the RootSIFT trunk
 
@@ -67,8 +67,8 @@ class PooledPatches(_Describing):
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         pixels = self.pixels(rgb)
         with torch.inference_mode():
-            features = self.describer.features(pixels)
-            vector = self.describer.model.global_projection(self.describer.model.netvlad(features))[0]
+            features, wide = self.describer.maps(pixels)
+            vector = self.describer.model.global_vector(self.describer.model.netvlad(features), wide)[0]
             patches = []
             for size, stride, rows, cols in self.describer.grids():
                 pooled = self.pool(features, size, stride)[0].flatten(1).T  # (rows * cols, C)
@@ -84,12 +84,8 @@ class GeM(_Describing):
         super().__init__(config, "gem")
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
-        images = torch.from_numpy(self.pixels(rgb)).to(self.describer.device).permute(2, 0, 1)[None].float() / 255.0
-        trunk = self.describer.model.trunk
         with torch.inference_mode():
-            features = getattr(trunk, "backbone", trunk)(images).float()
-            pooled = features.clamp(min=1e-6).pow(GEM_POWER).mean((2, 3)).pow(1 / GEM_POWER)
-            return {"global": F.normalize(pooled, dim=1)[0].cpu().numpy()}
+            return {"global": gem(self.describer.maps(self.pixels(rgb))[1])[0].cpu().numpy()}
 
 
 def multiscale_vlad(model: Model, rgb: NDArray[np.uint8], size: tuple[int, int]) -> Tensor:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pnv_core.compact import CompactTrunk
 from pnv_core.errors import ModelError
-from pnv_core.fit import FitOptions, local_samples, pca, projections_of, vocabulary_of
+from pnv_core.fit import FitOptions, local_samples, pca, pooled_projection_of, projections_of, vocabulary_of
 from pnv_core.model_files import Model, ModelInfo
 
 
@@ -50,5 +50,6 @@ def initial_model(
     whole.neck.load_state_dict({"weight": weight[:, :, None, None], "bias": torch.zeros(neck)})
     necks = [whole.neck(end[None]) for end in ends]
     netvlad = vocabulary_of(necks, options)
-    projections = projections_of(netvlad, necks, options)
-    return Model(info, whole, netvlad, *projections)
+    vlads, patches = projections_of(netvlad, necks, options)
+    pooled = pooled_projection_of(ends, options)
+    return Model(info, whole, netvlad, vlads, patches, pooled)

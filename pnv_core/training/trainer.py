@@ -30,7 +30,7 @@ from pnv_core.training.validation import ValidationSet, describe_all, recalls
 class TrainOptions:
     """Settings of a training. Learning rates are peaks of a cosine schedule with a linear start."""
 
-    steps: int = 900
+    steps: int = 700
     trunk_lr: float = 1.5e-4
     neck_lr: float = 3e-4
     vlad_lr: float = 1e-3
@@ -45,7 +45,7 @@ class TrainOptions:
     average: float = 0.995  # decay of the running average of weights that is kept
     blend: float = 0.5  # share of the trained weights in what is given, the rest is the start (WiSE-FT, CVPR 2022)
     warmup: int = 50
-    validate_every: int = 450
+    validate_every: int = 350
     save_every: int = 50
     workers: int = 2  # threads that make batches
     mixed: bool = True  # bfloat16 where the trunk computes
@@ -71,16 +71,15 @@ class Trainer:
         self.model, self.batches, self.validation = model, batches, validation
         self.options = options
         self.device = torch.device(device)
-        if model.patch_projection is None:
-            raise ModelError(
-                "the model's patches share the global projection; allowed here: a model with one of their own"
-            )
+        if model.patch_projection is None or model.pooled_projection is None:
+            raise ModelError("the model lacks a patch or a pooled projection; allowed here: a model that has both")
         self.parts = nn.ModuleDict(
             {
                 "trunk": model.trunk,
                 "netvlad": model.netvlad,
                 "whole": model.global_projection,
                 "parts": model.patch_projection,
+                "pooled": model.pooled_projection,
             }
         ).to(self.device)
         self.parts["trunk"].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -133,6 +132,7 @@ class Trainer:
             "netvlad": o.vlad_lr,
             "whole": o.projection_lr,
             "parts": o.projection_lr,
+            "pooled": o.projection_lr,
         }
         groups = []
         for prefix, rate in rates.items():
@@ -149,9 +149,9 @@ class Trainer:
 
     def _update(self, batch: Batch) -> dict[str, float]:
         self.parts.train()
-        features = self._features(batch.inputs.to(self.device))
-        x, weights = self.model.netvlad.soft_assign(features.float())
-        vectors = self.model.global_projection(self.model.netvlad.vlad(x, weights))
+        features, wide = self._maps(batch.inputs.to(self.device))
+        x, weights = self.model.netvlad.soft_assign(features)
+        vectors = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide)
         whole = multi_similarity(vectors, batch.positive.to(self.device), batch.negative.to(self.device))
         parts = self._patch_loss(batch, x, weights, (features.shape[-2], features.shape[-1]))
         loss = whole + self.options.patch_weight * parts
@@ -177,13 +177,15 @@ class Trainer:
             raise ModelError(f"the loss is {value} at step {self.step}; lower the learning rates")
         return {"loss": value, "global_loss": float(whole.detach()), "patch_loss": float(parts.detach())}
 
-    def _features(self, inputs: Tensor) -> Tensor:
-        """Feature maps of images, or of what the frozen layers gave for them."""
+    def _maps(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """The trunk's maps of images, or of what the frozen layers gave for them."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.options.mixed):
             if inputs.dtype == torch.uint8:
-                return self.model.trunk((inputs.float() / 255).contiguous(memory_format=torch.channels_last))
-            maps = inputs.float().contiguous(memory_format=torch.channels_last)
-            return self.model.trunk.back(maps, self.options.frozen_layers)  # type: ignore[operator]
+                found = self.model.trunk.maps((inputs.float() / 255).contiguous(memory_format=torch.channels_last))
+            else:
+                maps = inputs.float().contiguous(memory_format=torch.channels_last)
+                found = self.model.trunk.back(maps, self.options.frozen_layers)  # type: ignore[operator]
+        return found[0].float(), found[1].float()
 
     def _patch_loss(self, batch: Batch, x: Tensor, weights: Tensor, shape: tuple[int, int]) -> Tensor:
         """Mean over some image pairs of one scene, at one patch size."""
@@ -222,9 +224,8 @@ class Trainer:
         self._use_average()
         found: dict[str, float] = {}
         for known in self.validation:
-            args = (self.model.trunk, self.model.netvlad, self.model.global_projection)
             q, r = (
-                describe_all(*args, images, self.device, self.options.mixed)
+                describe_all(self.model, images, self.device, self.options.mixed)
                 for images in (known.queries, known.references)
             )
             found |= {f"{known.name} recall@{n}": value for n, value in recalls(q, r, known, (1, 5)).items()}

@@ -1,4 +1,4 @@
-"""Validation by retrieval on places kept out of training: seeded synthetic queries and, where there are, real ones."""
+"""Validation by retrieval on places kept out of training: seeded synthetic queries."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,10 +8,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnv_core.netvlad import NetVLAD, Projection
+from pnv_core.model_files import Model
 from pnv_core.training.augment import Camera, flat_view, panorama_view, relight
 from pnv_core.training.sources import PlaceImage, relation
-from pnv_core.trunks import Trunk
 
 YAWS = 8  # reference views of a panorama
 
@@ -56,23 +55,6 @@ def synthetic_queries(
     return ValidationSet(name, np.stack(queries), np.stack(references), relations > 0, relations != 0)
 
 
-def sequence_queries(
-    name: str, images: Sequence[PlaceImage], size: tuple[int, int], most: int, seed: int
-) -> ValidationSet:
-    """Every second image is a reference; real queries from the rest, those with a true reference."""
-    rng = np.random.default_rng(seed)
-    flat = [i for i in images if not i.panorama]
-    references, rest = flat[::2], flat[1::2]
-    table = np.array([[relation(q, r) for r in references] for q in rest])
-    usable = np.flatnonzero((table > 0).any(1) & (table < 0).any(1))
-    usable = np.sort(rng.permutation(usable)[:most])
-    plain: list[NDArray[np.uint8]] = [
-        np.stack([flat_view(i.rgb, size, 0.0, False, rng).pixels for i in chosen])
-        for chosen in ([rest[u] for u in usable], references)
-    ]
-    return ValidationSet(name, plain[0], plain[1], table[usable] > 0, table[usable] != 0)
-
-
 def recalls(
     queries: Tensor, references: Tensor, known: ValidationSet, at: Sequence[int] = (1, 5, 10)
 ) -> dict[int, float]:
@@ -85,17 +67,15 @@ def recalls(
 
 
 @torch.inference_mode()
-def describe_all(
-    trunk: Trunk, netvlad: NetVLAD, projection: Projection, images: NDArray[np.uint8], device: torch.device, mixed: bool
-) -> Tensor:
+def describe_all(model: Model, images: NDArray[np.uint8], device: torch.device, mixed: bool) -> Tensor:
     """(n, H, W, 3) uint8 -> global descriptors (n, D)."""
     found = []
     for start in range(0, len(images), 32):
         pixels = torch.from_numpy(images[start : start + 32]).to(device).permute(0, 3, 1, 2)
         batch = (pixels.float() / 255).contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=mixed):
-            features = trunk(batch)
-        found.append(projection(netvlad(features.float())))
+            features, wide = model.trunk.maps(batch)
+        found.append(model.global_vector(model.netvlad(features.float()), wide.float()))
     return torch.cat(found)
 
 

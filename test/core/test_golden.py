@@ -108,7 +108,7 @@ def test_encoder_features_equal_the_reference(golden, described, photos, width, 
     arrays = golden(f"K16_{width}x{height}")
     describer, _ = described(16, width, height, 0)
     with torch.inference_mode():
-        full = describer.features(resized(photos[0], width, height))[0].numpy()
+        full = describer.maps(resized(photos[0], width, height))[0][0].numpy()
     expected = arrays["feat_full_china"]
     assert np.abs(full - expected).max() <= 1e-4 * np.abs(expected).max()
 

@@ -47,7 +47,9 @@ def pool(picture_folder, imagenet_file, tmp_path):
 
 def trainer(pool, imagenet_file, folder, **changes):
     info = ModelInfo("compact", {"fires": 8, "neck": 12, "relu": True}, *VIEW, (2,), (1.0,))
-    fit = FitOptions(clusters=3, global_dim=6, patch_dim=5, image_width=96, image_height=80, patch_sizes=(2,))
+    fit = FitOptions(
+        clusters=3, global_dim=6, pooled_dim=3, patch_dim=5, image_width=96, image_height=80, patch_sizes=(2,)
+    )
     model = initial_model(imagenet_trunk(imagenet_file, 8, True), 12, pool.mild_maps, 11, info, fit)
     options = TrainOptions(
         steps=6,

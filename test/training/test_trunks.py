@@ -30,7 +30,10 @@ def test_front_and_back_make_the_whole_trunk():
     trunk = CompactTrunk().eval()
     images = torch.rand(2, 3, 96, 112)
     with torch.inference_mode():
-        assert torch.equal(trunk.back(trunk.front(images, 9), 9), trunk(images))
+        features, wide = trunk.back(trunk.front(images, 9), 9)
+        assert torch.equal(features, trunk(images))
+        assert torch.equal(trunk.neck(wide), features)
+        assert wide.shape[1] == trunk.width
 
 
 def test_rootsift_ignores_brightness_and_contrast():

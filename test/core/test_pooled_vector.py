@@ -1,0 +1,85 @@
+"""The part of the global vector beside the VLAD; oracle: NumPy, cell by cell."""
+
+import numpy as np
+import pytest
+import torch
+
+from pnv_core.compact import CompactTrunk
+from pnv_core.describer import Describer
+from pnv_core.errors import ModelError
+from pnv_core.model_files import Model, ModelInfo, load_model, save_model
+from pnv_core.netvlad import NetVLAD, Projection, gem
+
+WIDTH, HEIGHT = 96, 80
+
+
+def counted_mean(maps: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    channels = [sum(w * max(v, 1e-6) ** 3 for v, w in zip(c.ravel(), weights.ravel(), strict=True)) for c in maps]
+    root = np.array(channels) ** (1 / 3)
+    return root / np.linalg.norm(root)
+
+
+def pooled_model() -> Model:
+    torch.manual_seed(4)
+    trunk = CompactTrunk(fires=6, neck=8)
+    parts = [NetVLAD(3, 8), Projection(24, 6), Projection(24, 5), Projection(trunk.width, 4)]
+    for part in parts:
+        for parameter in part.parameters():
+            torch.nn.init.normal_(parameter)
+    info = ModelInfo("compact", {"fires": 6, "neck": 8, "relu": True}, WIDTH, HEIGHT, (2,), (1.0,))
+    return Model(info, trunk.eval().requires_grad_(False), *(p.requires_grad_(False) for p in parts))
+
+
+def image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_generalised_mean_counts_cells_by_their_weight(masked):
+    rng = np.random.default_rng(1)
+    maps = rng.normal(size=(1, 7, 4, 5))
+    weights = rng.uniform(0, 1, 20) if masked else np.ones(20)
+    found = gem(torch.from_numpy(maps), torch.from_numpy(weights)[None] if masked else None)
+    assert np.allclose(found[0].numpy(), counted_mean(maps[0], weights), atol=1e-6)
+
+
+def test_the_global_vector_is_the_projected_vlad_beside_the_projected_mean():
+    model = pooled_model()
+    describer = Describer(model)
+    vector = describer.describe(image(0)).global_vector.astype(np.float64)
+    with torch.inference_mode():
+        features, wide = describer.maps(image(0))
+        vlad = model.netvlad(features)[0].double().numpy()
+    halves = []
+    for part, given in ((model.global_projection, vlad), (model.pooled_projection, None)):
+        given = counted_mean(wide[0].double().numpy(), np.ones(wide[0, 0].numel())) if given is None else given
+        raw = part.weight.double().numpy() @ given + part.bias.double().numpy()
+        halves.append(raw / np.linalg.norm(raw) / np.sqrt(2))
+    assert np.allclose(vector, np.concatenate(halves), atol=1e-5)
+    assert model.global_dim == len(vector) == 10
+
+
+def test_a_mask_hides_cells_from_the_pooled_half_too():
+    """What changes well under the mask moves the vector by a tenth of what it does without one, or less."""
+    describer = Describer(pooled_model())
+    first, second = image(1), image(1)
+    second[64:] = 0
+    valid = np.ones((HEIGHT, WIDTH), bool)
+    valid[16:] = False
+    moved = [
+        np.linalg.norm(np.subtract(*(describer.describe(i, mask).global_vector[6:] for i in (first, second))))
+        for mask in (valid, None)
+    ]
+    assert moved[0] < 0.1 * moved[1]
+
+
+def test_a_model_file_keeps_the_pooled_part(tmp_path):
+    model = pooled_model()
+    save_model(model, tmp_path / "model.safetensors")
+    again = load_model(tmp_path / "model.safetensors")
+    assert again.fingerprint() == model.fingerprint()
+    assert np.array_equal(Describer(again).describe(image(3)).global_vector,
+                          Describer(model).describe(image(3)).global_vector)  # fmt: skip
+    wrong = Model(model.info, model.trunk, model.netvlad, model.global_projection, None, Projection(24, 4))
+    with pytest.raises(ModelError, match="pooled_projection"):
+        save_model(wrong, tmp_path / "wrong.safetensors")
