@@ -26,6 +26,7 @@ from benchmarks import baseline
 from benchmarks.growth import measured_growth, plotted
 from pnv_core.compact import CompactTrunk
 from pnv_core.config import Config
+from pnv_core.describer import load_describer
 from pnv_core.files import atomic_write
 from pnv_core.parallel import workers
 from pnv_core.patches import PatchAggregator, bfloat16_is_fast
@@ -170,6 +171,7 @@ def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: 
             patch_strides=(1, 1, 1),
             patch_weights=WEIGHTS,
             scorer=scorer,
+            scale_weight=0.0,
             match_mode=mode,
             threads=threads,
         )
@@ -194,6 +196,16 @@ def trunk_row(name: str, trunk: torch.nn.Module, size: tuple[int, int], rounds: 
         half, half_image = deepcopy(channels_last).bfloat16(), packed.bfloat16()
         sides["bfloat16"] = lambda: half(half_image)
     return compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
+
+
+def describing_row(size: tuple[int, int], threads: int, rounds: int) -> dict[str, Any]:
+    """Describer.describe of the default model with one and with three patch sizes."""
+    rgb = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
+    sides = {}
+    for sizes in ((2,), SIZES):
+        describer = load_describer(image_width=size[0], image_height=size[1], patch_sizes=sizes, threads=threads)
+        sides["patch size " + ", ".join(map(str, sizes))] = partial(describer.describe, rgb)
+    return compared(f"describe() at {size[0]}x{size[1]}", sides, rounds)
 
 
 def roofline(threads: int) -> dict[str, Any]:
@@ -258,6 +270,8 @@ def main() -> int:
         rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
         rows.append(reranking_row(128, "ransac", count, args.threads, 1 if args.quick else args.rounds))
         rows.append(trunk_row("compact trunk", CompactTrunk(), (240, 320), 5 * args.rounds))
+        sizes = ((320, 240),) if args.quick else ((320, 240), (384, 288), (640, 480))
+        rows += [describing_row(size, args.threads, 5 * args.rounds) for size in sizes]
         if not args.quick:
             rows.append(trunk_row("VGG16", VGG16Trunk(), (480, 640), args.rounds))
         growth = {} if args.quick else measured_growth(args.threads)

@@ -29,7 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         prog="pnv", description="Visual place recognition with Patch-NetVLAD.", allow_abbrev=False
     )
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name in COMMANDS:
+    given = list(sys.argv[1:] if argv is None else argv)
+    for name in COMMANDS if not given or given[0] not in COMMANDS else given[:1]:  # importing torch takes seconds
         import_module(f"pnv_cli.{name}").add_parser(subparsers)
     args = parser.parse_args(argv)
     try:

@@ -34,7 +34,7 @@ class CompactTrunk(Trunk):
     _SQUEEZE = (16, 16, 32, 32, 48, 48, 64, 64)
     _EXPAND = (64, 64, 128, 128, 192, 192, 256, 256)
 
-    def __init__(self, fires: int = 8, neck: int = 128, relu: bool = True) -> None:
+    def __init__(self, fires: int = 6, neck: int = 128, relu: bool = True) -> None:
         super().__init__()
         self.input = _ImageNetInput()
         layers: list[nn.Module] = [

@@ -143,6 +143,7 @@ class PatchAggregator:
         self.fast = fast and bfloat16_is_fast()
         self.centroids = centroids.detach().numpy()
         self.projection = projection.detach().view(-1, k, c).permute(1, 0, 2).contiguous()  # (K, D, C)
+        self.offsets = self.projection.numpy()  # the same in float32: of a centroid every bit counts
         if self.fast:
             self.projection = self.projection.bfloat16()
         self.bias = bias.detach().numpy()
@@ -225,7 +226,7 @@ class PatchAggregator:
                 np.matmul(x, columns.numpy().T, out=maps)
             else:
                 maps = torch.mm(rounded, columns.T).float().numpy()
-            projected = columns.float().numpy() @ centroids[k]
+            projected = self.offsets[k, first:end] @ centroids[k]
             for (a, b), total in zip(lanes, sums, strict=True):
                 offsets = projected[a:b]
                 windows = (*grid.shape, grid.sizes, grid.strides, grid.starts)
