@@ -22,6 +22,8 @@ OVERRIDABLE = (
     QoSPolicyKind.HISTORY,
     QoSPolicyKind.DEPTH,
 )
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"  # a publisher whose name is not discovered yet
+_MOST_LOOKS = 10
 _TYPES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": CompressedImage}
 
 
@@ -62,6 +64,7 @@ class ImageInputs:
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
         self._mismatches: dict[str, str] = {}  # topic: policy
+        self._looks: dict[str, int] = {}  # topic: how often the names of its publishers were looked up
         try:
             for topic in config.image_topics:
                 self._subscribe(topic, self._expected_type(topic))
@@ -177,10 +180,15 @@ class ImageInputs:
     def report_mismatches(self) -> None:
         """Say which publishers cannot be heard and what to change. Called a little after the event, since the
         publisher's name is discovered after its profile."""
-        for topic, policy in self._mismatches.items():
+        for topic, policy in list(self._mismatches.items()):
             subscription = self._subscriptions[topic]
             name, ours = subscription.topic_name, qos_in_words(subscription.qos_profile)
-            for publisher in self._publishers(topic):
+            publishers = self._publishers(topic)
+            self._looks[topic] = self._looks.get(topic, 0) + 1
+            if any(p.node_name == _UNKNOWN for p in publishers) and self._looks[topic] < _MOST_LOOKS:
+                continue
+            del self._mismatches[topic], self._looks[topic]
+            for publisher in publishers:
                 theirs = qos_in_words(publisher.qos_profile)
                 if theirs != ours:
                     self._node.get_logger().warning(
@@ -188,7 +196,6 @@ class ImageInputs:
                         f"this node asks for {ours}; set qos_overrides.{name}.subscription.{policy} to "
                         f"{_word(getattr(publisher.qos_profile, policy))}"
                     )
-        self._mismatches.clear()
 
 
 def qos_in_words(profile: QoSProfile) -> str:
