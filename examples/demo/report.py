@@ -20,6 +20,7 @@ from pnv_core.worlds import Sequence
 
 RADIUS_M, HEADING_DEG = 3.0, 40.0  # a closure is right within these
 LIGHT_AND_LINE = "the second lap has other light, another line and height"
+STAGES = " p50, p95, p99 [ms]"  # how the node's diagnostics name what a stage takes
 
 
 @dataclass
@@ -94,6 +95,9 @@ def print_table(run: Run) -> None:
         table["latency"] = (
             f"p50 {p50:.0f} ms, p95 {p95:.0f} ms   (image sent to result received, {len(latency)} queries)"
         )
+    for name, value in heard.counts.items():
+        if name.endswith(STAGES):
+            table[name.removesuffix(STAGES)] = f"{value} ms   (stage: p50, p95, p99)"
     print()
     for name, value in table.items():
         print(f"  {name:<18}{value}")
