@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Iterator
 
-from pnv_cli.sources import bag, image_folder, video
+from pnv_cli.sources import add_file_flags, bag, image_folder, video
 from pnv_core.types import Frame
 from pnv_core.worlds import KINDS, Sequence, loop_sequence
 
@@ -11,12 +11,7 @@ from pnv_core.worlds import KINDS, Sequence, loop_sequence
 def add_source_flags(parser: argparse.ArgumentParser) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--world", choices=tuple(KINDS), default="corridor", help="a rendered place; the default")
-    source.add_argument("--images", metavar="DIR", help="images in name order")
-    source.add_argument("--video", metavar="FILE")
-    source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")
-    parser.add_argument("--topic", help="image topic of the bag; default all image topics")
-    parser.add_argument("--fps", type=float, default=10.0, help="stamps of --images; default 10")
-    parser.add_argument("--timestamps", metavar="CSV", help="stamps of --images: columns frame,timestamp (seconds)")
+    add_file_flags(parser, source)
     parser.add_argument("--seed", type=int, default=1, help="of --world")
     parser.add_argument("--laps", type=float, default=2.0, help="rounds through --world")
     parser.add_argument("--speed", type=float, default=1.0, help="metres per second through --world")

@@ -28,7 +28,11 @@ class FrameSource:
 
 def add_source_flags(parser: argparse.ArgumentParser) -> None:
     """The flags that `source_of` reads."""
-    source = parser.add_mutually_exclusive_group(required=True)
+    add_file_flags(parser, parser.add_mutually_exclusive_group(required=True))
+
+
+def add_file_flags(parser: argparse.ArgumentParser, source: "argparse._MutuallyExclusiveGroup") -> None:
+    """The kinds of file into the group of which one is chosen, and what goes with them."""
     source.add_argument("--images", metavar="DIR", help="images in name order")
     source.add_argument("--video", metavar="FILE")
     source.add_argument("--bag", metavar="DIR", help="rosbag2, sqlite3 or mcap")

@@ -14,8 +14,6 @@ from tqdm import tqdm
 from pnv_cli.common import writable
 from pnv_core.errors import ConfigError
 
-FIRES = 6  # where the compact trunk is cut: what two more Fire modules add is tuned to ImageNet's classes
-
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("train", help="train a model for places (hours on a CPU, minutes with --pool)")
@@ -74,6 +72,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None:
+    from pnv_core.compact import FIRES
     from pnv_core.fit import FitOptions
     from pnv_core.model_files import ModelInfo, save_model
     from pnv_core.training.batches import BatchOptions, PlaceBatches
@@ -81,6 +80,8 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     from pnv_core.training.pool import FeaturePool
     from pnv_core.training.trainer import Trainer, TrainOptions
 
+    if not 1 <= args.pooled_dim < args.global_dim:
+        raise ConfigError(f"--pooled-dim {args.pooled_dim}; allowed: 1 to {args.global_dim - 1}, below --global-dim")
     given = {"seed": args.seed} if args.seed is not None else {}
     options = _options(TrainOptions, args.set, **given)
     size, view = _size(args.size), _size(args.view)

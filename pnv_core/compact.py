@@ -6,6 +6,8 @@ from torch import Tensor, nn
 
 from pnv_core.trunks import CELL, Trunk, _ImageNetInput
 
+FIRES = 6  # of SqueezeNet's eight Fire modules: what the last two add is tuned to ImageNet's classes
+
 
 class Fire(nn.Module):
     """Squeeze and expand (SqueezeNet 1.1, Iandola et al. 2016): 1x1, then 1x1 beside 3x3."""
@@ -34,7 +36,7 @@ class CompactTrunk(Trunk):
     _SQUEEZE = (16, 16, 32, 32, 48, 48, 64, 64)
     _EXPAND = (64, 64, 128, 128, 192, 192, 256, 256)
 
-    def __init__(self, fires: int = 6, neck: int = 128, relu: bool = True) -> None:
+    def __init__(self, fires: int = FIRES, neck: int = 128, relu: bool = True) -> None:
         super().__init__()
         self.input = _ImageNetInput()
         layers: list[nn.Module] = [

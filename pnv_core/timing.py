@@ -31,11 +31,11 @@ class StageTimer:
 
     def summary_ms(self) -> dict[str, tuple[float, float, float]]:
         """Per stage the median, 95th and 99th percentile in milliseconds of the latest calls."""
-        kept = ((name, 1e3 * np.array(list(durations))) for name, durations in list(self.durations.items()))
-        return {
-            name: (float(np.percentile(ms, 50)), float(np.percentile(ms, 95)), float(np.percentile(ms, 99)))
-            for name, ms in kept
-        }
+        found = {}
+        for name, durations in list(self.durations.items()):
+            median, late, latest = 1e3 * np.percentile(list(durations), (50, 95, 99))
+            found[name] = float(median), float(late), float(latest)
+        return found
 
 
 class TimeBudget:
