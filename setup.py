@@ -59,7 +59,7 @@ setup(
     maintainer_email="pnv_ros@users.noreply.github.com",
     license="MIT",
     python_requires=">=3.11",
-    packages=find_packages(include=["pnv_core*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
+    packages=find_packages(include=["pnv_core*", "pnv_lab*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
     package_data={"pnv_core": ["models/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),

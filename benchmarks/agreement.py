@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 
 from pnv_core import load_describer
 from pnv_core.config import Config
-from pnv_core.describer import Describer
+from pnv_core.describe.describer import Describer
 from pnv_core.files import atomic_write
-from pnv_core.matching import mutual_nearest
-from pnv_core.reranker import Reranker
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.matching import mutual_nearest
+from pnv_core.verify.reranker import Reranker
 
 SIZES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
 MODES = {

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pnv_core.images import read_image
 from pnv_core.types import Frame
-from pnv_core.worlds.sequences import loop_sequence
+from pnv_lab.worlds.sequences import loop_sequence
 
 FIT = ("icl", "ikuta", "walks", "world_corridor", "tower")
 JUDGE = ("donkey", "pepper", "kitti03", "multifloor", "gardens", "essex", "webcams", "panoramas")

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.closure_sets import FIT, IGNORE, JUDGE, TRUE, TruthSequence, sequence
-from pnv_core.calibrating import SURE_REVISIT
-from pnv_core.calibration import Calibration, fit_calibration, reliability, write_calibration
 from pnv_core.config import Config
-from pnv_core.describer import Describer, describer_from
+from pnv_core.decide.calibration import Calibration, fit_calibration, reliability, write_calibration
+from pnv_core.describe.describer import Describer, describer_from
+from pnv_core.describe.download import resolve_weights
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import LoopClosure, PatchGrid, PlaceDescriptor
-from pnv_core.weights import resolve_weights
+from pnv_lab.calibrating import SURE_REVISIT
 
 
 class RememberedDescriber:

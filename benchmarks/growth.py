@@ -11,10 +11,10 @@ import torch.nn.functional as F
 
 from pnv_core.config import Config
 from pnv_core.database import KeyframeDatabase
-from pnv_core.parallel import workers
-from pnv_core.patches import PatchAggregator
-from pnv_core.reranker import Reranker
+from pnv_core.describe.patches import PatchAggregator
+from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.reranker import Reranker
 
 _ROUNDS = 3
 _CHANNELS = 512

@@ -35,8 +35,8 @@ from msg_adapters.loop_closures import closures_from_message
 from pnv_core import load_describer
 from pnv_core.database import KeyframeDatabase
 from pnv_core.files import atomic_write
-from pnv_core.local_features import thumbnail
 from pnv_core.maps import MapStore
+from pnv_core.verify.local_features import thumbnail
 from pnv_ros.outputs import CLOSURES_QOS
 from test.ros.processes import Listener, own_domain, running_node, wait_until
 

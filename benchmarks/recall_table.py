@@ -20,16 +20,16 @@ import torch
 from numpy.typing import NDArray
 
 from pnv_core.config import Config
-from pnv_core.describer import Describer, describer_from, resized
-from pnv_core.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
-from pnv_core.model_files import make_trunk
-from pnv_core.netvlad import NetVLAD, gem
-from pnv_core.reranker import Reranker
-from pnv_core.training.initial import imagenet_trunk
-from pnv_core.training.sources import is_held, load_set
-from pnv_core.training.validation import synthetic_queries
-from pnv_core.trunks import Trunk
+from pnv_core.describe.describer import Describer, describer_from, resized
+from pnv_core.describe.model_files import make_trunk
+from pnv_core.describe.netvlad import NetVLAD, gem
+from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.types import PlaceDescriptor
+from pnv_core.verify.reranker import Reranker
+from pnv_lab.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
+from pnv_lab.training.initial import imagenet_trunk
+from pnv_lab.training.sources import is_held, load_set
+from pnv_lab.training.validation import synthetic_queries
 
 SIZE = (320, 240)
 RECALLS = (1, 5, 10)

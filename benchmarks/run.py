@@ -24,15 +24,15 @@ import torch.nn.functional as F
 
 from benchmarks import baseline
 from benchmarks.growth import measured_growth, plotted
-from pnv_core.compact import CompactTrunk
 from pnv_core.config import Config
-from pnv_core.describer import load_describer
+from pnv_core.describe.describer import load_describer
+from pnv_core.describe.patches import PatchAggregator, bfloat16_is_fast
+from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.describe.trunks.vgg16 import VGG16Trunk
 from pnv_core.files import atomic_write
-from pnv_core.parallel import workers
-from pnv_core.patches import PatchAggregator, bfloat16_is_fast
-from pnv_core.reranker import Reranker
-from pnv_core.trunks import VGG16Trunk
+from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.reranker import Reranker
 
 SIZES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
 CELLS = (30, 40)  # of 640x480

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from pnv_cli.sources import add_file_flags, bag, image_folder, video
 from pnv_core.types import Frame
-from pnv_core.worlds import KINDS, Sequence, loop_sequence
+from pnv_lab.worlds import KINDS, Sequence, loop_sequence
 
 
 def add_source_flags(parser: argparse.ArgumentParser) -> None:

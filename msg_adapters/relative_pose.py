@@ -4,7 +4,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 
 from msg_adapters.loop_closures import to_time
 from pnv_core.errors import PnvError
-from pnv_core.geometry import RelativePose
+from pnv_core.pose.geometry import RelativePose
 from pnv_core.types import LoopClosure
 
 

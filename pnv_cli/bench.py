@@ -110,8 +110,8 @@ def _as_settings(chosen: Measured, candidates: int) -> dict[str, Any]:
 
 def _sizes(config: Config) -> list[tuple[int, int]]:
     """The size the user named, or the model's and smaller ones that still hold its patches."""
-    from pnv_core.describer import describer_from
-    from pnv_core.trunks import CELL
+    from pnv_core.describe.describer import describer_from
+    from pnv_core.describe.trunks.trunk import CELL
 
     done = describer_from(config).config
     own = (done.image_width, done.image_height)
@@ -127,7 +127,7 @@ def _images(folder: str | None) -> list[NDArray[np.uint8]]:
         from pnv_core.images import list_images, read_image
 
         return [read_image(p) for p in list_images(folder)[:8]]
-    from pnv_core.worlds import World
+    from pnv_lab.worlds import World
 
     world = World(0, "street")
     return [world.render(world.pose_on_route(m), size=(640, 480)) for m in (0.0, 0.5, 10.0, 20.0)]
@@ -135,8 +135,8 @@ def _images(folder: str | None) -> list[NDArray[np.uint8]]:
 
 def _measure(config: Config, images: Sequence[NDArray[np.uint8]], seconds: float) -> list[Measured]:
     """Both scorers at one image size."""
-    from pnv_core.describer import describer_from
-    from pnv_core.reranker import Reranker
+    from pnv_core.describe.describer import describer_from
+    from pnv_core.verify.reranker import Reranker
 
     describer = describer_from(config)
     described = [describer.describe(image) for image in images]

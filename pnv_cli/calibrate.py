@@ -4,7 +4,10 @@ import argparse
 
 from pnv_cli.common import add_config_flags, config_from, writable
 from pnv_cli.sources import add_source_flags, source_of
-from pnv_core.calibrating import (
+from pnv_core.describe.describer import describer_from
+from pnv_core.describe.model_files import save_model
+from pnv_core.errors import ConfigError, PnvError
+from pnv_lab.calibrating import (
     calibrated,
     cross_checked,
     gathered,
@@ -13,9 +16,6 @@ from pnv_core.calibrating import (
     truth_of_time,
     without_unlabelled_loops,
 )
-from pnv_core.describer import describer_from
-from pnv_core.errors import ConfigError, PnvError
-from pnv_core.model_files import save_model
 
 _LEAST = 30  # examples of either kind below which a fit says little
 

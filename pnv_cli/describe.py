@@ -5,7 +5,7 @@ import argparse
 import numpy as np
 
 from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_core.describer import describer_from
+from pnv_core.describe.describer import describer_from
 from pnv_core.files import atomic_write
 from pnv_core.images import read_image
 

@@ -137,8 +137,8 @@ def _faiss() -> Finding:
 
 
 def _model() -> Finding:
-    from pnv_core.describer import load_describer
-    from pnv_core.weights import PUBLISHED
+    from pnv_core.describe.describer import load_describer
+    from pnv_core.describe.download import PUBLISHED
 
     try:
         describer = load_describer()
@@ -240,7 +240,7 @@ def _memory() -> Finding:
 
 
 def _cache() -> Finding:
-    from pnv_core.weights import cache_folder
+    from pnv_core.describe.download import cache_folder
 
     folder = cache_folder()
     try:

@@ -16,9 +16,9 @@ from pnv_core.errors import ConfigError
 from pnv_core.files import atomic_write
 
 if TYPE_CHECKING:
-    from pnv_core.evaluation.datasets import Dataset, SequenceRule
-    from pnv_core.evaluation.evaluate import Evaluation, MethodResult
-    from pnv_core.evaluation.summary import Figures
+    from pnv_lab.evaluation.datasets import Dataset, SequenceRule
+    from pnv_lab.evaluation.evaluate import Evaluation, MethodResult
+    from pnv_lab.evaluation.summary import Figures
 
 _FORMATS = ("results.csv", "results.json", "tables.txt")
 
@@ -54,10 +54,10 @@ def run(args: argparse.Namespace) -> int:
         return _list()
     if not args.root:
         raise ConfigError("--root is missing; allowed: the folder of a data set")
-    from pnv_core.evaluation.evaluate import Evaluation
-    from pnv_core.evaluation.grid import grid_search
-    from pnv_core.evaluation.methods import parse_methods
-    from pnv_core.evaluation.summary import detail_table, paper_table
+    from pnv_lab.evaluation.evaluate import Evaluation
+    from pnv_lab.evaluation.grid import grid_search
+    from pnv_lab.evaluation.methods import parse_methods
+    from pnv_lab.evaluation.summary import detail_table, paper_table
 
     report = writable(args.report) if args.report else None
     out = _out_folder(args.out)
@@ -85,8 +85,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    from pnv_core.evaluation.datasets import KINDS
-    from pnv_core.evaluation.methods import GROUPS, METHODS
+    from pnv_lab.evaluation.datasets import KINDS
+    from pnv_lab.evaluation.methods import GROUPS, METHODS
 
     print("data set layouts: " + ", ".join((*KINDS, "bag")))
     for name, method in METHODS.items():
@@ -98,7 +98,7 @@ def _list() -> int:
 
 
 def _opened(args: argparse.Namespace, config: Config, cache: Path, root: Path) -> "Dataset":
-    from pnv_core.evaluation.datasets import SequenceRule, open_dataset
+    from pnv_lab.evaluation.datasets import SequenceRule, open_dataset
 
     rule = SequenceRule(args.radius_m, args.angle_deg, config.exclude_recent_s)
     for name, value in (("--radius-m", args.radius_m), ("--angle-deg", args.angle_deg), ("--every-s", args.every_s)):
@@ -117,7 +117,7 @@ def _opened(args: argparse.Namespace, config: Config, cache: Path, root: Path) -
 
 def _bag(args: argparse.Namespace, cache: Path, root: Path, rule: "SequenceRule") -> "Dataset":
     from pnv_cli.bag_frames import unpacked
-    from pnv_core.evaluation.datasets.sequences import poses_csv
+    from pnv_lab.evaluation.datasets.sequences import poses_csv
 
     return poses_csv(unpacked(root, cache / "bags", args.image_topic, args.pose_topic, args.every_s, progress), rule)
 
@@ -147,7 +147,7 @@ def _print_grid(name: str, points: Sequence[Any]) -> None:
 
 
 def _figures(results: Sequence["MethodResult"]) -> list["Figures"]:
-    from pnv_core.evaluation.summary import figures_of
+    from pnv_lab.evaluation.summary import figures_of
 
     return [f for result in results for f in figures_of(result)]
 
@@ -165,8 +165,8 @@ def _out_folder(text: str | None) -> Path | None:
 def _write_all(
     out: Path, figures: Sequence["Figures"], tables: str, results: Sequence[Sequence["MethodResult"]]
 ) -> None:
-    from pnv_core.evaluation.datasets.seasons import write_submission
-    from pnv_core.evaluation.summary import csv_text
+    from pnv_lab.evaluation.datasets.seasons import write_submission
+    from pnv_lab.evaluation.summary import csv_text
 
     contents = {
         "results.csv": csv_text(figures),
@@ -189,7 +189,7 @@ def _write_report(
     figures: Sequence[Sequence["Figures"]],
     args: argparse.Namespace,
 ) -> None:
-    from pnv_core.evaluation.report import Chapter, evaluation_report
+    from pnv_lab.evaluation.report import Chapter, evaluation_report
 
     chapters = [Chapter(r, f) for r, f in zip(results, figures, strict=True)]
     words = ["pnv", "evaluate", "--dataset", args.dataset, "--method", args.method]

@@ -10,10 +10,10 @@ import torch
 from tqdm import tqdm
 
 from pnv_cli.common import writable
+from pnv_core.describe.download import resolve_weights
+from pnv_core.describe.model_files import Model, ModelInfo, load_model, make_trunk, save_model
 from pnv_core.errors import ConfigError
-from pnv_core.fit import FitOptions, adapt_model, fit_model, image_files
-from pnv_core.model_files import Model, ModelInfo, load_model, make_trunk, save_model
-from pnv_core.weights import resolve_weights
+from pnv_lab.fit import FitOptions, adapt_model, fit_model, image_files
 
 _UNTRAINED = ("rootsift",)  # trunks that need no weights
 
@@ -109,11 +109,11 @@ def _report(args: argparse.Namespace, base: Model | None, output: Path) -> None:
     """Recall with the model the fit began from and with the fitted one."""
     from pnv_cli.recall import progress
     from pnv_core.config import Config
-    from pnv_core.evaluation.datasets.pairs import pairs_dataset
-    from pnv_core.evaluation.evaluate import Evaluation
-    from pnv_core.evaluation.methods import configured_method, global_method
-    from pnv_core.evaluation.metrics import recall_at
-    from pnv_core.evaluation.store import default_cache
+    from pnv_lab.evaluation.datasets.pairs import pairs_dataset
+    from pnv_lab.evaluation.evaluate import Evaluation
+    from pnv_lab.evaluation.methods import configured_method, global_method
+    from pnv_lab.evaluation.metrics import recall_at
+    from pnv_lab.evaluation.store import default_cache
 
     dataset = pairs_dataset(args.queries, args.references, args.matches)
     print(f"{'':8}{'global R@1':>12}{'R@5':>7}{'re-ranked R@1':>16}{'R@5':>7}")

@@ -6,13 +6,13 @@ import json
 import cv2
 
 from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_core.describer import describer_from
+from pnv_core.describe.describer import describer_from
 from pnv_core.drawing import draw_match
 from pnv_core.errors import ConfigError
 from pnv_core.files import atomic_write
 from pnv_core.images import read_image
-from pnv_core.reranker import Reranker
-from pnv_core.spatial import ransac_score, rapid_spatial_score
+from pnv_core.verify.reranker import Reranker
+from pnv_core.verify.spatial import ransac_score, rapid_spatial_score
 
 PICTURES = (".png", ".jpg", ".jpeg")
 

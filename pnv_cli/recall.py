@@ -45,7 +45,7 @@ def add_extraction_flags(parser: argparse.ArgumentParser) -> None:
 
 def checked_extraction(args: argparse.Namespace) -> Path:
     """The cache folder. Raises ConfigError for flags out of range."""
-    from pnv_core.evaluation.store import default_cache
+    from pnv_lab.evaluation.store import default_cache
 
     if not 1 <= args.workers <= 256:
         raise ConfigError(f"--workers {args.workers} is out of range; allowed: 1 to 256")
@@ -64,10 +64,10 @@ def progress(items: Iterable[Any], count: int, what: str) -> Iterable[Any]:
 
 
 def run(args: argparse.Namespace) -> int:
-    from pnv_core.evaluation.datasets.pairs import pairs_dataset
-    from pnv_core.evaluation.evaluate import Evaluation
-    from pnv_core.evaluation.methods import configured_method, global_method
-    from pnv_core.evaluation.metrics import recall_at
+    from pnv_lab.evaluation.datasets.pairs import pairs_dataset
+    from pnv_lab.evaluation.evaluate import Evaluation
+    from pnv_lab.evaluation.methods import configured_method, global_method
+    from pnv_lab.evaluation.metrics import recall_at
 
     config = config_from(args)
     cache = checked_extraction(args)

@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from pnv_cli.common import add_config_flags, config_from, writable
 from pnv_cli.sources import add_source_flags, source_of
-from pnv_core.calibration import CONSERVATIVE
-from pnv_core.describer import describer_from
+from pnv_core.decide.calibration import CONSERVATIVE
+from pnv_core.describe.describer import describer_from
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.files import atomic_write
 from pnv_core.recognizer import PlaceRecognizer
@@ -22,7 +22,7 @@ from pnv_core.timing import StageTimer
 from pnv_core.types import LoopClosure
 
 if TYPE_CHECKING:
-    from pnv_core.evaluation.run_report import RunRecorder
+    from pnv_lab.evaluation.run_report import RunRecorder
 
 COLUMNS = (
     "query",
@@ -92,13 +92,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _recorder(recognizer: PlaceRecognizer) -> "RunRecorder":
-    from pnv_core.evaluation.run_report import RunRecorder
+    from pnv_lab.evaluation.run_report import RunRecorder
 
     return RunRecorder(recognizer.describer.image_size)
 
 
 def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespace, names: Names) -> None:
-    from pnv_core.evaluation.run_report import read_positions
+    from pnv_lab.evaluation.run_report import read_positions
 
     positions = read_positions(Path(args.poses), [stamp for _, stamp in names]) if args.poses else None
     taken = Path(args.images or args.video or args.bag).name

@@ -11,9 +11,9 @@ import cv2
 
 from msg_adapters.images import message_to_frame
 from pnv_core.errors import ConfigError, ImageError, PnvError
-from pnv_core.evaluation.datasets.tables import rows
 from pnv_core.images import list_images, read_image
 from pnv_core.types import Frame
+from pnv_lab.evaluation.datasets.tables import rows
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 

@@ -72,13 +72,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None:
-    from pnv_core.compact import FIRES
-    from pnv_core.fit import FitOptions
-    from pnv_core.model_files import ModelInfo, save_model
-    from pnv_core.training.batches import BatchOptions, PlaceBatches
-    from pnv_core.training.initial import imagenet_trunk, initial_model
-    from pnv_core.training.pool import FeaturePool
-    from pnv_core.training.trainer import Trainer, TrainOptions
+    from pnv_core.describe.model_files import ModelInfo, save_model
+    from pnv_core.describe.trunks.compact import FIRES
+    from pnv_lab.fit import FitOptions
+    from pnv_lab.training.batches import BatchOptions, PlaceBatches
+    from pnv_lab.training.initial import imagenet_trunk, initial_model
+    from pnv_lab.training.pool import FeaturePool
+    from pnv_lab.training.trainer import Trainer, TrainOptions
 
     if not 1 <= args.pooled_dim < args.global_dim:
         raise ConfigError(f"--pooled-dim {args.pooled_dim}; allowed: 1 to {args.global_dim - 1}, below --global-dim")
@@ -122,11 +122,11 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
     """Patch-NetVLAD's own training; the projection is fitted afterwards, as the authors do."""
     import numpy as np
 
-    from pnv_core.fit import FitOptions, as_batch, projections_of, vocabulary_of
-    from pnv_core.model_files import Model, ModelInfo, save_model
-    from pnv_core.training.augment import flat_view
-    from pnv_core.training.triplets import TripletOptions, TripletTrainer
-    from pnv_core.training.vgg import imagenet_vgg16
+    from pnv_core.describe.model_files import Model, ModelInfo, save_model
+    from pnv_lab.fit import FitOptions, as_batch, projections_of, vocabulary_of
+    from pnv_lab.training.augment import flat_view
+    from pnv_lab.training.triplets import TripletOptions, TripletTrainer
+    from pnv_lab.training.vgg import imagenet_vgg16
 
     given = {"seed": args.seed} if args.seed is not None else {}
     options = _options(TripletOptions, args.set, **given)
@@ -165,7 +165,7 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
 
 def _split(folders: Iterable[str]) -> tuple[list[Any], list[Any]]:
     """The images of every set under the folders: those to train on, and those kept out to validate on."""
-    from pnv_core.training.sources import is_held, load_set
+    from pnv_lab.training.sources import is_held, load_set
 
     sets: list[Path] = []
     for folder in map(Path, folders):
@@ -182,8 +182,8 @@ def _split(folders: Iterable[str]) -> tuple[list[Any], list[Any]]:
 
 
 def _validation(held: list[Any]) -> list[Any]:
-    from pnv_core.training.sources import HELD_SETS
-    from pnv_core.training.validation import synthetic_queries
+    from pnv_lab.training.sources import HELD_SETS
+    from pnv_lab.training.validation import synthetic_queries
 
     size = (320, 240)
     tower = [i for i in held if i.set_name == "ie_tower"]
@@ -221,7 +221,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _report(journal: Any, folder: Path, output: Path) -> None:
-    from pnv_core.training.journal import plot
+    from pnv_lab.training.journal import plot
 
     try:
         plot(journal, folder / "training.png")

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from pnv_core.describer import read_model
+from pnv_core.describe.describer import read_model
+from pnv_core.describe.download import DEFAULT_MODEL, PUBLISHED, fetch, file_sha256, recorded_sha256
 from pnv_core.errors import ModelError
-from pnv_core.weights import DEFAULT_MODEL, PUBLISHED, fetch, file_sha256, recorded_sha256
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:

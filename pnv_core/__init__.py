@@ -7,7 +7,7 @@ from pnv_core.config import Config
 from pnv_core.types import Frame, LoopClosure, PatchGrid, PlaceDescriptor
 
 if TYPE_CHECKING:
-    from pnv_core.describer import Describer, load_describer
+    from pnv_core.describe.describer import Describer, load_describer
 
 __all__ = ["Config", "Describer", "Frame", "LoopClosure", "PatchGrid", "PlaceDescriptor", "load_describer"]
 
@@ -15,7 +15,7 @@ __all__ = ["Config", "Describer", "Frame", "LoopClosure", "PatchGrid", "PlaceDes
 def __getattr__(name: str) -> Any:
     """The describer needs torch, which takes seconds to import: only who asks for it waits."""
     if name in ("Describer", "load_describer"):
-        from pnv_core import describer
+        from pnv_core.describe import describer
 
         return getattr(describer, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,15 +3,15 @@
 from dataclasses import replace
 
 from pnv_core.config import Config
-from pnv_core.consistency import SequenceMemory, confirmed, window_of
 from pnv_core.database import KeyframeDatabase
-from pnv_core.describer import Describer
-from pnv_core.judging import Judge
-from pnv_core.keyframes import KeyframeSelector
-from pnv_core.local_features import thumbnail
-from pnv_core.odometry import Odometry
+from pnv_core.database.selection import KeyframeSelector
+from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
+from pnv_core.decide.judge import Judge
+from pnv_core.decide.odometry import Odometry
+from pnv_core.describe.describer import Describer
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, Reason
+from pnv_core.verify.local_features import thumbnail
 
 
 class PlaceRecognizer:

@@ -18,11 +18,11 @@ from sensor_msgs.msg import CameraInfo
 from msg_adapters.camera_info import Rectifier
 from msg_adapters.images import stamp_of
 from pnv_core.database import KeyframeDatabase
-from pnv_core.describer import Describer, describer_from
+from pnv_core.describe.describer import Describer, describer_from
 from pnv_core.errors import ConfigError, MapError, PnvError
 from pnv_core.maps import Autosave, SaveReport
+from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.relative_poses import RelativePoses
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
 from pnv_ros.diagnostics import Diagnostics

@@ -16,7 +16,7 @@ from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam
 from msg_adapters.pictures import rgb_to_message
 from msg_adapters.relative_pose import relative_pose_to_message
 from pnv_core.drawing import draw_match
-from pnv_core.relative_poses import RelativePoses
+from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from msg_adapters.camera_info import Rectifier
 from msg_adapters.images import MIN_SIDE
 from pnv_core.errors import ConfigError, ImageError
-from pnv_core.geometry import Intrinsics
+from pnv_core.pose.geometry import Intrinsics
 from pnv_core.types import Frame
 
 

@@ -13,13 +13,13 @@ import pytest
 
 from pnv_cli.main import COMMANDS, main
 from pnv_core.config import Config
-from pnv_core.describer import load_describer
+from pnv_core.describe.describer import load_describer
 from pnv_core.maps import MapStore
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.settings import settings_of
 from pnv_core.types import Frame
 from pnv_ros.node_config import NodeConfig
-from test.evaluation.places import place, write
+from test.lab.evaluation.places import place, write
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -45,7 +45,7 @@ def commands(text: str, prompt: str) -> Iterator[str]:
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A working folder with everything the documentation's examples name."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("pnv_core.evaluation.store.default_cache", lambda: tmp_path / "cache")
+    monkeypatch.setattr("pnv_lab.evaluation.store.default_cache", lambda: tmp_path / "cache")
     walk = [place(s % 8, shift=3 * (s > 7), width=192, height=144) for s in range(16)]
     for name in ("DIR", "images"):
         for i, rgb in enumerate(walk):

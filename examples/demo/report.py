@@ -14,9 +14,9 @@ from examples.sources import named_frames
 from pnv_core import load_describer
 from pnv_core.drawing import draw_match
 from pnv_core.files import atomic_write
-from pnv_core.reranker import Reranker
 from pnv_core.types import LoopClosure
-from pnv_core.worlds import Sequence
+from pnv_core.verify.reranker import Reranker
+from pnv_lab.worlds import Sequence
 
 RADIUS_M, HEADING_DEG = 3.0, 40.0  # a closure is right within these
 LIGHT_AND_LINE = "the second lap has other light, another line and height"

@@ -28,9 +28,9 @@ from examples.publisher import IMAGE_TOPIC, INFO_TOPIC, ODOMETRY_TOPIC
 from examples.sources import add_source_flags, named_frames
 from pnv_core import load_describer
 from pnv_core.errors import PnvError
-from pnv_core.geometry import Intrinsics
+from pnv_core.pose.geometry import Intrinsics
+from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.relative_poses import RelativePoses
 
 _LATE_S, _LATEST_S = 4.0, 20.0  # the node may still work on the last frames
 _SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"

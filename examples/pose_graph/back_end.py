@@ -23,7 +23,7 @@ from msg_adapters.images import stamp_of
 from msg_adapters.loop_closures import closures_from_message, to_time
 from msg_adapters.stamp_ids import NodePair, StampIds
 from pnv_core.types import LoopClosure
-from pnv_core.worlds import CAMERA_IN_BODY
+from pnv_lab.worlds import CAMERA_IN_BODY
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from examples.pose_graph.drift import Drift
 from examples.pose_graph.graph import Noise
-from pnv_core.worlds import Camera, Pose, loop_sequence
+from pnv_lab.worlds import Camera, Pose, loop_sequence
 
 Array = NDArray[np.float64]
 

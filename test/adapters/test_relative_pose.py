@@ -6,8 +6,8 @@ import pytest
 
 from msg_adapters.relative_pose import relative_pose_to_message
 from pnv_core.errors import PnvError
-from pnv_core.export import GraphPose, closures_to_csv, graph_to_g2o
-from pnv_core.geometry import RelativePose
+from pnv_core.pose.export import GraphPose, closures_to_csv, graph_to_g2o
+from pnv_core.pose.geometry import RelativePose
 from pnv_core.types import Evidence, ImageRef, LoopClosure
 
 TURN = cv2.Rodrigues(np.array([0.1, -0.4, 0.2]))[0]

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from pnv_cli.main import main
-from pnv_core.model_files import save_model
+from pnv_core.describe.model_files import save_model
 from test.core.small import small_model
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 
 from pnv_core.config import Config
-from pnv_core.describer import Describer
-from pnv_core.model_files import Model, ModelInfo, make_trunk
-from pnv_core.netvlad import NetVLAD, Projection
+from pnv_core.describe.describer import Describer
+from pnv_core.describe.model_files import Model, ModelInfo, make_trunk
+from pnv_core.describe.netvlad import NetVLAD, Projection
 
 WIDTH, HEIGHT = 192, 160
 

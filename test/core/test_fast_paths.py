@@ -8,16 +8,17 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnv_core import kernels, matching, spatial
+from pnv_core import kernels
 from pnv_core.config import Config
-from pnv_core.matching import mutual_nearest, patch_rows
-from pnv_core.parallel import spans, workers
-from pnv_core.patches import PatchAggregator, bfloat16_is_fast, patch_descriptors
+from pnv_core.describe.patches import PatchAggregator, bfloat16_is_fast, patch_descriptors
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.reranker import Reranker
-from pnv_core.spatial import homography_inliers
+from pnv_core.threads import spans, workers
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, PatchGrid, PlaceDescriptor, Reason
+from pnv_core.verify import matching, spatial
+from pnv_core.verify.matching import mutual_nearest, patch_rows
+from pnv_core.verify.reranker import Reranker
+from pnv_core.verify.spatial import homography_inliers
 from test.core.small import HEIGHT, WIDTH, small_describer
 
 compiled = pytest.mark.skipif(not kernels.COMPILED, reason="numba is not installed")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from pnv_core import weights as published
-from pnv_core.checkpoints import load_checkpoint
-from pnv_core.describer import Describer
+from pnv_core.describe import download as published
+from pnv_core.describe.checkpoints import load_checkpoint
+from pnv_core.describe.describer import Describer
+from pnv_core.describe.model_files import load_model, save_model
+from pnv_core.describe.trunks.vgg16 import VGG16Trunk
 from pnv_core.errors import ModelError
-from pnv_core.model_files import load_model, save_model
-from pnv_core.trunks import VGG16Trunk
 from test.core.small import HEIGHT, WIDTH, small_model
 
 

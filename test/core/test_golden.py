@@ -13,14 +13,14 @@ import pytest
 import torch
 from PIL import Image
 
-from pnv_core.checkpoints import load_checkpoint
 from pnv_core.config import Config
-from pnv_core.describer import Describer
-from pnv_core.matching import mutual_nearest
-from pnv_core.netvlad import NetVLAD
-from pnv_core.patches import patch_descriptors, patch_vlads
-from pnv_core.spatial import fused_score, ransac_score, rapid_spatial_score
+from pnv_core.describe.checkpoints import load_checkpoint
+from pnv_core.describe.describer import Describer
+from pnv_core.describe.netvlad import NetVLAD
+from pnv_core.describe.patches import patch_descriptors, patch_vlads
 from pnv_core.types import PatchGrid
+from pnv_core.verify.matching import mutual_nearest
+from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score
 
 SIZES = (2, 5, 8)
 DIGESTS = {
@@ -94,7 +94,7 @@ def grid_of(descriptors, size, width, height):
 
 
 def test_resizing_equals_the_reference_to_the_bit(shared, photos):
-    from pnv_core.describer import resized
+    from pnv_core.describe.describer import resized
 
     for width, height in ((320, 240), (640, 480)):
         expected = np.asarray(Image.open(shared / "golden" / "images" / f"resized_china_{width}x{height}.png"))
@@ -103,7 +103,7 @@ def test_resizing_equals_the_reference_to_the_bit(shared, photos):
 
 @pytest.mark.parametrize(("width", "height"), [(320, 240), (640, 480)])
 def test_encoder_features_equal_the_reference(golden, described, photos, width, height):
-    from pnv_core.describer import resized
+    from pnv_core.describe.describer import resized
 
     arrays = golden(f"K16_{width}x{height}")
     describer, _ = described(16, width, height, 0)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from pnv_core.compact import CompactTrunk
-from pnv_core.describer import Describer
+from pnv_core.describe.describer import Describer
+from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
+from pnv_core.describe.netvlad import NetVLAD, Projection, gem
+from pnv_core.describe.trunks.compact import CompactTrunk
 from pnv_core.errors import ModelError
-from pnv_core.model_files import Model, ModelInfo, load_model, save_model
-from pnv_core.netvlad import NetVLAD, Projection, gem
 
 WIDTH, HEIGHT = 96, 80
 

@@ -6,12 +6,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnv_core.matching import mutual_nearest
-from pnv_core.netvlad import NetVLAD, alpha_rule
-from pnv_core.patches import patch_descriptors, window_sums
-from pnv_core.reranker import Reranker
-from pnv_core.spatial import ransac_score, rapid_spatial_score
+from pnv_core.describe.netvlad import NetVLAD, alpha_rule
+from pnv_core.describe.patches import patch_descriptors, window_sums
 from pnv_core.types import PatchGrid
+from pnv_core.verify.matching import mutual_nearest
+from pnv_core.verify.reranker import Reranker
+from pnv_core.verify.spatial import ransac_score, rapid_spatial_score
 from test.core.small import HEIGHT, WIDTH, noise_image, small_describer
 
 

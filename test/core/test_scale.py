@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pnv_core.config import Config
-from pnv_core.reranker import Reranker
-from pnv_core.spatial import scale_change
 from pnv_core.types import PatchMatches
+from pnv_core.verify.reranker import Reranker
+from pnv_core.verify.spatial import scale_change
 from test.core.small import noise_image, small_describer
 
 

@@ -39,7 +39,7 @@ def test_a_second_visit_is_found_and_reported(tmp_path: Path) -> None:
 def test_input_without_a_revisit_ends_with_1_and_says_why(tmp_path: Path) -> None:
     images = tmp_path / "images"
     images.mkdir()
-    from pnv_core.worlds import loop_sequence
+    from pnv_lab.worlds import loop_sequence
 
     sequence = loop_sequence(2, "hall", laps=1.0, fps=2.0, size=(160, 120))
     for number in range(12):

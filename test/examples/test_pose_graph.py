@@ -13,7 +13,7 @@ from examples.pose_graph.report import false_closures, trajectory_error, trial
 from examples.pose_graph.sequences import world
 from examples.publisher import odometry_message
 from pnv_core.types import ImageRef, LoopClosure
-from pnv_core.worlds import Pose
+from pnv_lab.worlds import Pose
 
 
 def _circle(nodes: int, turns: float) -> np.ndarray:

@@ -1,0 +1,213 @@
+"""From what is known of a candidate to P(same place).
+
+A logistic model over a few features, each with a weight of at least zero: more similarity, more inliers or a wider
+spread never lower the score. It was fitted on pairs of known truth, so its output can be read as a probability, as
+`reliability` shows.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from safetensors import safe_open
+
+from pnv_core.config import Config
+from pnv_core.describe.model_files import load_model, save_model
+from pnv_core.errors import ModelError
+from pnv_core.types import Evidence
+
+Array = NDArray[np.float64]
+
+_CHANCE = 8  # as many local features agree on some epipolar geometry by chance
+_LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
+
+# Every feature grows with the belief in the candidate. Similarity and the leads are left out where local features
+# speak: fitted on some sets and judged on others they cost more than they give, as their scale is that of a place.
+_FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
+    "patches": {
+        "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
+        "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
+        "spread": lambda e: e.spread,
+        "similarity": lambda e: e.similarity,
+        "lead": lambda e: max(e.lead, 0.0),
+        "recent_lead": lambda e: e.recent_lead,
+        "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
+    },
+    "verified": {
+        "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
+        "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
+        "local_inliers": lambda e: math.log(max(e.local_inliers, _CHANCE) / _CHANCE),
+        "local_spread": lambda e: e.local_spread,
+    },
+}
+_VALUES = _FEATURES["patches"] | _FEATURES["verified"]
+
+
+@dataclass(frozen=True)
+class Logistic:
+    """P = 1 / (1 + exp(-(bias + sum of weight * feature))), weights by feature name, none negative."""
+
+    bias: float
+    weights: dict[str, float]
+
+    def probability(self, evidence: Evidence) -> float:
+        logit = self.bias + sum(weight * _VALUES[name](evidence) for name, weight in self.weights.items())
+        return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """P(same place) of candidates that only their patches speak for, and of those that local features verified.
+
+    It holds for the scorer, patch sizes and image size it was fitted with.
+    """
+
+    patches: Logistic
+    verified: Logistic
+    scorer: str = "ransac"
+    patch_sizes: tuple[int, ...] = ()
+    image_size: tuple[int, int] = (0, 0)
+    source: str = ""  # what it was fitted on
+
+    def probability(self, evidence: Evidence) -> float:
+        model = self.patches if evidence.local_inliers < 0 else self.verified
+        return model.probability(evidence)
+
+    def suits(self, config: Config) -> bool:
+        """Whether it was fitted with the geometry and scorer of a completed Config."""
+        size = (config.image_width, config.image_height)
+        return (self.scorer, self.patch_sizes, self.image_size) == (config.scorer, config.patch_sizes, size)
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, given: dict[str, Any]) -> "Calibration":
+        """Raises ModelError for anything but what `to_json` writes."""
+        try:
+            models = {}
+            for name, features in _FEATURES.items():
+                weights = {str(k): float(v) for k, v in given[name]["weights"].items()}
+                bias = float(given[name]["bias"])
+                wrong = sorted(set(weights) - set(features))
+                if wrong or not all(0 <= w < math.inf for w in weights.values()) or not math.isfinite(bias):
+                    allowed = ", ".join(features)
+                    raise ModelError(f"calibration.{name} = {given[name]}; allowed: weights >= 0 of {allowed}")
+                models[name] = Logistic(bias, weights)
+            width, height = given["image_size"]
+            sizes = tuple(int(size) for size in given["patch_sizes"])
+            return cls(**models, scorer=given["scorer"], patch_sizes=sizes, image_size=(int(width), int(height)),
+                       source=str(given["source"]))  # fmt: skip
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise ModelError(f"calibration is incomplete or malformed ({error!r}); refit: pnv calibrate") from None
+
+
+# For models without a calibration of their own. The patch part never passes 0.5: patch scores of an unknown model have
+# an unknown scale. Local features are the same whatever the model: at a spatial score of 0.2, 20 of them are worth 0.5.
+CONSERVATIVE = Calibration(
+    Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0}),
+    Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0, "local_inliers": 6.0}),
+    source="no calibration of this model",
+)
+
+
+def calibration_for(stored: dict[str, Any] | None, config: Config) -> Calibration:
+    """The calibration in a model file's metadata, or the conservative one where none suits the Config."""
+    if stored is None:
+        return CONSERVATIVE
+    calibration = Calibration.from_json(stored)
+    return calibration if calibration.suits(config) else CONSERVATIVE
+
+
+def write_calibration(path: Path | str, calibration: Calibration) -> None:
+    """Put the calibration into a model file, whole or not at all; the tensors and the fingerprint stay as they are."""
+    with safe_open(str(path), framework="pt") as file:
+        kept = {file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118 - no mapping
+    model = load_model(path).with_info(calibration=calibration.to_json())
+    save_model(model, path, dtype=kept.pop() if len(kept) == 1 else torch.float32)
+
+
+def fit_calibration(
+    examples: Sequence[tuple[Evidence, bool]], weights: Array, config: Config, source: str
+) -> Calibration:
+    """Both models from evidence of known truth; examples not examined by local features serve the patch model alone.
+
+    `weights` (N,) says how much each example counts. Raises ModelError if either class is missing.
+    """
+    truth = np.array([label for _, label in examples], bool)
+    if truth.all() or not truth.any():
+        raise ModelError(f"{len(truth)} candidates, {truth.sum()} of them true; allowed: some true and some false ones")
+    examined = np.array([e.local_inliers >= 0 for e, _ in examples])
+    models = {}
+    for name, features in _FEATURES.items():
+        use = examined if name == "verified" else np.ones_like(examined)
+        if not truth[use].any() or truth[use].all():
+            models[name] = CONSERVATIVE.verified
+            continue
+        table = np.array([[f(e) for f in features.values()] for (e, _), u in zip(examples, use, strict=True) if u])
+        models[name] = _fit_logistic(table, truth[use], weights[use], list(features))
+    size = (config.image_width, config.image_height)
+    return Calibration(models["patches"], models["verified"], config.scorer, config.patch_sizes, size, source)
+
+
+def _fit_logistic(
+    table: Array, truth: NDArray[np.bool_], weights: Array, names: list[str], ridge: float = 1e-3
+) -> Logistic:
+    """Weighted maximum likelihood with non-negative weights and a small ridge on the standardised features."""
+    centre, scale = table.mean(0), table.std(0) + 1e-9
+    x = np.column_stack([np.ones(len(table)), (table - centre) / scale])
+    share = weights / weights.sum()
+    sign = np.where(truth, 1.0, -1.0)
+
+    def loss(theta: Array) -> tuple[float, Array]:
+        margin = sign * (x @ theta)
+        gradient = -(share * sign / (1.0 + np.exp(np.clip(margin, -500, 500)))) @ x
+        penalty = np.concatenate([[0.0], ridge * theta[1:]])
+        return float(share @ np.logaddexp(0.0, -margin) + 0.5 * penalty @ theta), gradient + penalty
+
+    bounds = [(None, None)] + [(0.0, None)] * table.shape[1]
+    from scipy.optimize import minimize  # half a second that recognition need not wait for at start
+
+    theta = minimize(loss, np.zeros(x.shape[1]), jac=True, bounds=bounds, method="L-BFGS-B").x
+    slopes = theta[1:] / scale
+    return Logistic(
+        float(theta[0] - slopes @ centre), {n: round(float(w), 6) for n, w in zip(names, slopes, strict=True)}
+    )
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Per occupied bin of the score: mean score, share of true ones, count."""
+
+    score: Array
+    share_true: Array
+    count: NDArray[np.int64]
+
+    @property
+    def expected_error(self) -> float:
+        """Expected calibration error: mean |score - share true|, weighted by count (Naeini et al., AAAI 2015)."""
+        return float(np.abs(self.score - self.share_true) @ self.count / max(self.count.sum(), 1))
+
+
+def reliability(scores: Array, truth: NDArray[np.bool_], bins: int = 10) -> Reliability:
+    """The reliability diagram of scores (N,) in [0, 1] in bins of equal width."""
+    place = np.minimum((np.asarray(scores) * bins).astype(int), bins - 1)
+    count = np.bincount(place, minlength=bins)
+    used = count > 0
+    mean = [np.bincount(place, values, minlength=bins)[used] / count[used] for values in (scores, truth.astype(float))]
+    return Reliability(mean[0], mean[1], count[used])
+
+
+def threshold_for_precision(scores: Array, truth: NDArray[np.bool_], precision: float) -> float:
+    """The least score from which on at least `precision` of all candidates are true; above 1 if there is none."""
+    order = np.argsort(-np.asarray(scores), kind="stable")
+    ranked, good = np.asarray(scores)[order], np.asarray(truth, bool)[order]
+    reached = np.cumsum(good) / np.arange(1, len(good) + 1) >= precision
+    last = np.append(ranked[1:] < ranked[:-1], True)  # a threshold cannot part equal scores
+    usable = np.flatnonzero(reached & last)
+    return float(ranked[usable[-1]]) if len(usable) else math.nextafter(1.0, 2.0)

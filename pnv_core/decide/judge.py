@@ -1,0 +1,140 @@
+"""What speaks for each candidate, weighed: patches first, then local features of the best ones, then P(same place)."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pnv_core.config import Config
+from pnv_core.decide.calibration import Calibration, calibration_for
+from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
+from pnv_core.verify.local_features import Verifier, hull_area
+from pnv_core.verify.reranker import Reranker, SpatialResult
+
+_NEIGHBOURS = 10  # keyframes this close in number show one place
+
+Candidate = tuple[ImageRef, float, PlaceDescriptor]  # keyframe, similarity, descriptor
+
+
+class Judge:
+    """Scores the candidates of a query with the re-ranker and calibration of a completed Config."""
+
+    def __init__(self, config: Config, stored_calibration: dict | None) -> None:
+        self.reranker = Reranker(config)
+        self.verifier = Verifier()
+        self.calibration: Calibration = calibration_for(stored_calibration, config)
+
+    def judged(
+        self,
+        query: ImageRef,
+        descriptor: PlaceDescriptor,
+        predecessor: float,
+        candidates: Sequence[Candidate],
+        config: Config,
+        limit: int | None = None,
+    ) -> list[LoopClosure]:
+        """A LoopClosure per candidate, best first, none accepted yet.
+
+        Those beyond the first `limit`, and those the re-ranker leaves out, are refused as not re-ranked.
+
+        `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
+        `config.verify` best are examined by local features where both images have a thumbnail. An image with less
+        texture than `config.min_texture` scores 0.
+        """
+        examined = candidates[:limit]
+        results = self.reranker.scores(descriptor, [reference for _, _, reference in examined])
+        scored = {i: result for i, result in enumerate(results) if result is not None}
+        left_out = [i for i in range(len(candidates)) if i not in scored]
+        found = []
+        for number, result in scored.items():
+            ref, similarity, reference = candidates[number]
+            elsewhere = [i for i, (other, _, _) in enumerate(candidates) if _apart(other, ref)]
+            evidence = Evidence(
+                similarity=similarity,
+                spatial=result.score,
+                inliers=result.inliers,
+                spread=spread(descriptor, reference, result.matches),
+                distortion=distortion(descriptor, reference, result.matches),
+                lead=min((similarity - candidates[i][1] for i in elsewhere), default=0.0),
+                recent_lead=similarity - predecessor,
+                spatial_lead=min((result.score - scored[i].score for i in elsewhere if i in scored), default=0.0),
+                texture=min(descriptor.texture, reference.texture),
+            )
+            found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
+        found.sort(key=lambda pair: _rank(pair[0]))
+        if descriptor.thumbnail and config.verify:
+            pictures = [(candidates[i][2].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
+            shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
+            self.verifier.look_at(shown, self.reranker.workers)
+        for place, (closure, evidence, number) in enumerate(found[: config.verify]):
+            picture = candidates[number][2].thumbnail
+            if descriptor.thumbnail and picture:
+                check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
+                seen = replace(evidence, local_inliers=check.inliers, local_spread=check.spread)
+                verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
+                found[place] = verified, seen, number
+        # what ranked lower and was not examined is not believed more than what was
+        most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
+        closures = [c if e.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c, e, _ in found]
+        rest = [_not_reranked(query, *candidates[i], descriptor.texture) for i in left_out]
+        return sorted(closures + rest, key=_rank)
+
+    def _closure(
+        self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float
+    ) -> LoopClosure:
+        score = self.calibration.probability(evidence) if evidence.texture >= min_texture else 0.0
+        return LoopClosure(
+            query, match, score, evidence.similarity, result.score, result.inliers, False,
+            matches=result.matches, evidence=evidence,
+        )  # fmt: skip
+
+
+def _not_reranked(
+    query: ImageRef, match: ImageRef, similarity: float, reference: PlaceDescriptor, texture: float
+) -> LoopClosure:
+    evidence = Evidence(similarity=similarity, spatial=0.0, inliers=0, texture=min(texture, reference.texture))
+    return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
+
+
+def _rank(closure: LoopClosure) -> tuple[float, float, int]:
+    return -closure.score, -closure.similarity, closure.match.id
+
+
+def _apart(a: ImageRef, b: ImageRef) -> bool:
+    return a.session != b.session or abs(a.id - b.id) > _NEIGHBOURS
+
+
+def _inlier_points(
+    query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 2), (N, 2) pixels of the inliers of every patch size, pooled; all matches where none was tested."""
+    pairs = []
+    for q, r, m in zip(query.patches, reference.patches, matches, strict=True):
+        use = m.inlier if m.inlier.any() else np.ones(len(m.query), bool)
+        pairs.append((q.keypoints()[m.query[use]], r.keypoints()[m.reference[use]]))
+    return np.concatenate([p for p, _ in pairs]), np.concatenate([p for _, p in pairs])
+
+
+def spread(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
+    """Convex hull of the patch inliers as a share of what the patch centres span, the smaller of both images."""
+    q, r = _inlier_points(query, reference, matches)
+    centres = max(query.patches, key=lambda grid: len(grid.descriptors)).keypoints()
+    span = float(np.ptp(centres, axis=0).prod())
+    return min(hull_area(q), hull_area(r)) / span if span else 0.0
+
+
+def distortion(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
+    """How far the affine map from reference to query is from a shift: the Frobenius norm of its linear part less I.
+
+    A robot back at a place sees it little rotated and scaled; chance matches shrink to a point, mirror or shear.
+    Infinite for fewer than three inliers or inliers on a line.
+    """
+    q, r = _inlier_points(query, reference, matches)
+    if len(q) < 3:
+        return float("inf")
+    centred = r - r.mean(0)
+    scatter = centred.T @ centred
+    if np.linalg.cond(scatter) > 1e8:
+        return float("inf")
+    linear = np.linalg.solve(scatter, centred.T @ (q - q.mean(0)))
+    return float(np.linalg.norm(linear - np.eye(2)))

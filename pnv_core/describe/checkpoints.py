@@ -1,0 +1,81 @@
+"""Official Patch-NetVLAD checkpoints: a torch file of {num_pcs, state_dict} holding VGG16, NetVLAD and WPCA.
+
+K clusters, P output dimensions. Both are read from the shapes.
+"""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pnv_core.describe.model_files import Model, ModelInfo, build_model
+from pnv_core.describe.trunks.vgg16 import VGG16Trunk
+from pnv_core.errors import ModelError
+
+
+def load_checkpoint(path: Path | str) -> Model:
+    """Read an official checkpoint (float32 or float64 WPCA, `module.` prefixes allowed).
+
+    Only plain tensors are unpickled (weights_only). Raises ModelError for anything else, naming file and fault.
+    """
+    source = str(path)
+    try:
+        content = torch.load(source, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise ModelError(f"{source}: no such checkpoint file") from None
+    except pickle.UnpicklingError:
+        raise ModelError(
+            f"{source}: is no plain tensor file (its pickle is damaged or holds other objects); refused"
+        ) from None
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise ModelError(f"{source}: not a readable torch checkpoint, or truncated ({reason[:160]})") from None
+    return build_model(
+        ModelInfo(trunk="vgg16", provenance=f"checkpoint {Path(source).name}"), _renamed(content, source), source
+    )
+
+
+def _renamed(content: Any, source: str) -> dict[str, Tensor]:
+    """The checkpoint's tensors under the names of a model file."""
+    state = content.get("state_dict") if isinstance(content, dict) else None
+    if not isinstance(state, dict):
+        held = sorted(map(str, content)) if isinstance(content, dict) else type(content).__name__
+        raise ModelError(f"{source}: holds {held}; allowed: a dict of num_pcs and state_dict")
+    expected = {f"encoder.{name.removeprefix('features.')}": f"trunk.{name}" for name in VGG16Trunk().state_dict()}
+    expected |= {
+        "pool.centroids": "netvlad.centroids",
+        "pool.conv.weight": "netvlad.assignment",
+        "WPCA.0.weight": "global_projection.weight",
+        "WPCA.0.bias": "global_projection.bias",
+    }
+    tensors: dict[str, Tensor] = {}
+    unexpected = []
+    for given, tensor in state.items():
+        key = str(given).replace("module.", "")
+        if key not in expected or not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+            unexpected.append(str(given))
+            continue
+        name = expected[key]
+        if name in tensors:
+            raise ModelError(f"{source}: {key} occurs twice, with and without 'module.'")
+        tensors[name] = tensor.flatten(1) if name in ("netvlad.assignment", "global_projection.weight") else tensor
+    if unexpected:
+        raise ModelError(
+            f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; "
+            f"allowed: {', '.join(list(expected)[:2])}, ... WPCA.0.bias"
+        )
+    if missing := [key for key, name in expected.items() if name not in tensors]:
+        raise ModelError(f"{source}: lacks {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}")
+    for key in ("pool.conv.weight", "WPCA.0.weight"):
+        raw = next(t for k, t in state.items() if str(k).replace("module.", "") == key)
+        if raw.ndim != 4 or raw.shape[2:] != (1, 1):
+            raise ModelError(
+                f"{source}: {key} has shape {tuple(raw.shape)}; allowed: a 1x1 convolution (outputs, inputs, 1, 1)"
+            )
+    pcs = content.get("num_pcs")
+    outputs = tensors["global_projection.bias"].numel()
+    if pcs is not None and (not isinstance(pcs, int) or pcs != outputs):
+        raise ModelError(f"{source}: num_pcs says {pcs!r} but WPCA.0.bias has {outputs} entries")
+    return tensors

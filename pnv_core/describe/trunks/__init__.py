@@ -1,0 +1,1 @@
+"""Feature trunks: an image to a dense feature map."""

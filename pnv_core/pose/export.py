@@ -1,0 +1,99 @@
+"""Closures for offline tools: CSV, and g2o pose graphs."""
+
+import csv
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.pose.geometry import RelativePose
+from pnv_core.types import LoopClosure
+
+Array = NDArray[np.float64]
+
+CSV_COLUMNS = (
+    "query_stamp_ns", "match_stamp_ns", "query_id", "match_id", "query_camera", "match_camera", "score", "similarity",
+    "spatial", "inliers", "spread", "local_inliers", "local_spread", "accepted", "reason",
+)  # fmt: skip
+
+
+def closures_to_csv(closures: Sequence[LoopClosure]) -> str:
+    """One row per closure, refused ones too; stamps as whole nanoseconds."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    for c in closures:
+        e = c.evidence
+        seen = ("", "", "") if e is None else (f"{e.spread:.4f}", e.local_inliers, f"{e.local_spread:.4f}")
+        writer.writerow(
+            (c.query.stamp_ns, c.match.stamp_ns, c.query.id, c.match.id, c.query.camera, c.match.camera,
+             f"{c.score:.6f}", f"{c.similarity:.6f}", f"{c.spatial:.6f}", c.inliers, *seen, int(c.accepted), c.reason)
+        )  # fmt: skip
+    return text.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class GraphPose:
+    """A node of a pose graph: position (3,) in metres and quaternion (4,) as x, y, z, w."""
+
+    position: Array
+    quaternion: Array
+
+
+def graph_to_g2o(
+    nodes: Mapping[int, GraphPose],
+    closures: Sequence[tuple[LoopClosure, RelativePose | None]],
+    odometry_sigma: tuple[float, float] = (0.05, 0.01),
+) -> str:
+    """A 3D pose graph: nodes by keyframe id, edges between successive nodes, and an edge per metric closure.
+
+    The nodes' poses are the camera's (optical frame), as odometry saw them. `odometry_sigma` is metres and radians per
+    edge. A closure without scale becomes a comment: an edge would have to make one up. Closures of keyframes that are
+    no nodes are left out.
+    """
+    lines = [f"VERTEX_SE3:QUAT {i} {_numbers(n.position)} {_numbers(n.quaternion)}" for i, n in sorted(nodes.items())]
+    order = sorted(nodes)
+    information = np.diag([odometry_sigma[0] ** -2] * 3 + [odometry_sigma[1] ** -2] * 3)
+    for a, b in itertools.pairwise(order):
+        rotation = _matrix(nodes[a].quaternion)
+        position = rotation.T @ (np.asarray(nodes[b].position) - nodes[a].position)
+        lines.append(_edge(a, b, position, _quaternion(rotation.T @ _matrix(nodes[b].quaternion)), information))
+    for closure, pose in closures:
+        a, b = closure.match.id, closure.query.id
+        if a not in nodes or b not in nodes:
+            continue
+        if pose is None or not pose.metric or pose.covariance is None:
+            lines.append(f"# closure {a} {b} score {closure.score:.6f} without scale")
+        else:
+            information = np.linalg.inv(pose.covariance).astype(np.float64)
+            lines.append(_edge(a, b, pose.translation, pose.quaternion, information))
+    return "\n".join(lines) + "\n"
+
+
+def _edge(a: int, b: int, position: Array, quaternion: Array, information: Array) -> str:
+    # g2o's rotation error is the vector part of the quaternion, half the angle: its information is four times as large
+    scale = np.array([1, 1, 1, 2, 2, 2])
+    upper = (information * np.outer(scale, scale))[np.triu_indices(6)]
+    return f"EDGE_SE3:QUAT {a} {b} {_numbers(position)} {_numbers(quaternion)} {_numbers(upper)}"
+
+
+def _numbers(values: Sequence[float] | Array) -> str:
+    return " ".join(f"{float(v):.9g}" for v in values)
+
+
+def _matrix(q: Array) -> Array:
+    x, y, z, w = np.asarray(q, np.float64) / np.linalg.norm(q)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _quaternion(rotation: Array) -> Array:
+    return RelativePose(rotation, np.zeros(3), metric=False, inliers=0).quaternion

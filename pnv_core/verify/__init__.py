@@ -1,0 +1,1 @@
+"""What speaks for a candidate: patches and local features that agree with one geometry."""

@@ -1,0 +1,1 @@
+"""The laboratory: what makes the recogniser and measures it. Never imported on a robot."""

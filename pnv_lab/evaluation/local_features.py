@@ -1,0 +1,107 @@
+"""Baselines by local features: SIFT from OpenCV, and LightGlue where the user has installed it.
+
+n features of an image. Candidates come from NetVLAD and are ordered by inliers, as the paper does for SuperGlue.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.describe.describer import resized
+from pnv_core.errors import ConfigError
+
+RATIO = 0.8  # Lowe 2004, section 7.1
+TOLERANCE_PX = 3.0  # of the epipolar line, OpenCV's default
+MAX_FEATURES = 1000
+LIGHTGLUE_KINDS = {"lightglue-superpoint": "LightGlue on SuperPoint", "lightglue-aliked": "LightGlue on ALIKED"}
+
+
+def sift_record(rgb: NDArray[np.uint8], size: tuple[int, int]) -> dict[str, NDArray]:
+    """points (n, 2) float32 pixels and descriptors (n, 128) uint8 of the image resized to `size` (width, height)."""
+    grey = cv2.cvtColor(resized(rgb, *size), cv2.COLOR_RGB2GRAY)
+    keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, None)
+    points = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
+    if descriptors is None:
+        descriptors = np.empty((0, 128), np.float32)
+    return {"points": points, "descriptors": descriptors.round().clip(0, 255).astype(np.uint8)}
+
+
+def ratio_matches(
+    query: NDArray, reference: NDArray, ratio: float = RATIO
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n_q, D), (n_r, D) -> matched features: the nearest is closer than `ratio` times the second nearest."""
+    if not len(query) or len(reference) < 2:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    q, r = query.astype(np.float32), reference.astype(np.float32)
+    squared = (q**2).sum(1)[:, None] + (r**2).sum(1)[None] - 2 * q @ r.T
+    two = np.argpartition(squared, 1, axis=1)[:, :2]
+    distances = np.take_along_axis(squared, two, 1).clip(min=0)
+    order = np.argsort(distances, axis=1, kind="stable")
+    distances = np.take_along_axis(distances, order, 1)
+    nearest = np.take_along_axis(two, order, 1)[:, 0]
+    kept = np.flatnonzero(distances[:, 0] < ratio**2 * distances[:, 1])
+    return kept.astype(np.int64), nearest[kept].astype(np.int64)
+
+
+def sift_score(query: Mapping[str, NDArray], reference: Mapping[str, NDArray]) -> float:
+    """Share of the query's features that agree with one fundamental matrix, in [0, 1]."""
+    q, r = ratio_matches(query["descriptors"], reference["descriptors"])
+    return _epipolar_inliers(query["points"][q], reference["points"][r]) / max(len(query["points"]), 1)
+
+
+def _epipolar_inliers(query: NDArray, reference: NDArray) -> int:
+    if len(query) < 8:  # the eight-point algorithm
+        return 0
+    _, mask = cv2.findFundamentalMat(reference, query, cv2.FM_RANSAC, TOLERANCE_PX, 0.99)
+    return 0 if mask is None else int(mask.sum())
+
+
+def lightglue_extractor(kind: str, device: str) -> Callable[[NDArray[np.uint8]], dict[str, NDArray]]:
+    """A function from an image to LightGlue's features as arrays. Raises ConfigError where it is not installed."""
+    lightglue, torch = _lightglue(kind)
+    maker = lightglue.SuperPoint if kind == "lightglue-superpoint" else lightglue.ALIKED
+    network = maker(max_num_keypoints=MAX_FEATURES).eval().to(_device(device))
+
+    def record(rgb: NDArray[np.uint8]) -> dict[str, NDArray]:
+        image = torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255.0
+        with torch.inference_mode():
+            found = network.extract(image.to(_device(device)))
+        return {name: value[0].cpu().numpy() for name, value in found.items()}
+
+    return record
+
+
+def lightglue_scorer(kind: str, device: str) -> Callable[[Mapping[str, NDArray], Mapping[str, NDArray]], float]:
+    """Share of the query's features that LightGlue matches and one fundamental matrix explains."""
+    lightglue, torch = _lightglue(kind)
+    matcher = lightglue.LightGlue(features=kind.removeprefix("lightglue-")).eval().to(_device(device))
+    names = ("keypoints", "keypoint_scores", "descriptors", "image_size")
+
+    def score(query: Mapping[str, NDArray], reference: Mapping[str, NDArray]) -> float:
+        def batch(record: Mapping[str, NDArray]) -> dict[str, Any]:
+            return {n: torch.from_numpy(record[n])[None].to(_device(device)) for n in names if n in record}
+
+        with torch.inference_mode():
+            matches = matcher({"image0": batch(query), "image1": batch(reference)})["matches"][0].cpu().numpy()
+        found = _epipolar_inliers(query["keypoints"][matches[:, 0]], reference["keypoints"][matches[:, 1]])
+        return found / max(len(query["keypoints"]), 1)
+
+    return score
+
+
+def _device(name: str) -> str:
+    import torch
+
+    return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
+
+
+def _lightglue(kind: str) -> tuple[Any, Any]:
+    try:
+        import lightglue
+        import torch
+    except ImportError:
+        raise ConfigError(f"--method {kind} needs the package lightglue, which is not installed here") from None
+    return lightglue, torch

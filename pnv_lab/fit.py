@@ -1,0 +1,269 @@
+"""Fitting without training: vocabulary and projections from a user's own images.
+
+K clusters, C channels, D dimensions, M samples.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from pnv_core.describe.describer import resized
+from pnv_core.describe.model_files import Model, ModelInfo
+from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule, gem
+from pnv_core.describe.patches import patch_vlads
+from pnv_core.describe.trunks.trunk import CELL, Trunk
+from pnv_core.errors import ModelError
+
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".ppm", ".tif", ".tiff")
+SHRINKAGE = 0.9  # of the whitening that adapts a trained projection; less of it forgets what training learned
+SAMPLES_PER_DIMENSION = 4  # images a whitened principal direction is estimated from; with fewer it is mostly noise
+Progress = Callable[[Iterable[Path], str], Iterable[Path]]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """Sizes of a fitted model. `whiten` divides each principal direction by its standard deviation."""
+
+    clusters: int = 16
+    global_dim: int = 512
+    pooled_dim: int = 0  # of them, how many are of the pooled features; 0 = a global vector of the VLAD alone
+    patch_dim: int = 128
+    image_width: int = 320
+    image_height: int = 240
+    patch_sizes: tuple[int, ...] = (2, 3, 5)
+    patch_weights: tuple[float, ...] = (0.34, 0.33, 0.33)
+    whiten: bool = True
+    cells_per_image: int = 100
+    patches_per_image: int = 24
+    seed: int = 0
+
+
+def image_files(folders: Sequence[Path | str]) -> list[Path]:
+    """Every image under the folders, in name order. Raises ModelError for a folder that is missing or has none."""
+    found: list[Path] = []
+    for folder in map(Path, folders):
+        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+        if not files:
+            raise ModelError(f"{folder}: no folder with images; allowed: files ending in {', '.join(IMAGE_SUFFIXES)}")
+        found += files
+    return found
+
+
+def read_rgb(path: Path, width: int, height: int) -> np.ndarray:
+    """(height, width, 3) uint8, resized as the describer does. Raises ModelError for a file that is no image."""
+    try:
+        with Image.open(path) as image:
+            return resized(np.asarray(image.convert("RGB")), width, height)
+    except (OSError, ValueError) as error:
+        raise ModelError(f"{path}: not a readable image ({error})") from None
+
+
+def as_batch(images: Sequence[np.ndarray] | np.ndarray, device: torch.device | str = "cpu") -> Tensor:
+    """(H, W, 3) uint8 images -> (B, 3, H, W) float in [0, 1], channels last in memory."""
+    pixels = torch.from_numpy(np.stack(list(images))).to(device)
+    return (pixels.permute(0, 3, 1, 2).float() / 255.0).contiguous(memory_format=torch.channels_last)
+
+
+def spherical_kmeans(samples: Tensor, clusters: int, generator: torch.Generator, iterations: int = 50) -> Tensor:
+    """(M, C) unit rows -> (K, C): the mean of each cluster of samples, clusters by cosine (k-means++ seeds).
+
+    The means are not normalised: NetVLAD's residuals are taken against them (its appendix).
+    Raises ModelError for fewer samples than clusters.
+    """
+    if len(samples) < clusters:
+        raise ModelError(f"{len(samples)} local features cannot make {clusters} clusters; allowed: at most as many")
+    chosen = [int(torch.randint(len(samples), (1,), generator=generator))]
+    distance = 1 - samples @ samples[chosen[0]]
+    for _ in range(clusters - 1):
+        odds = distance.clamp(min=1e-9)
+        chosen.append(int(torch.multinomial(odds, 1, generator=generator)))
+        distance = torch.minimum(distance, 1 - samples @ samples[chosen[-1]])
+    means = samples[chosen].clone()
+    previous = None
+    for _ in range(iterations):
+        nearest = (samples @ F.normalize(means, dim=1).T).argmax(1)  # (M,)
+        if previous is not None and torch.equal(nearest, previous):
+            break
+        previous = nearest
+        counts = torch.bincount(nearest, minlength=clusters)
+        sums = torch.zeros_like(means).index_add_(0, nearest, samples)
+        empty = counts == 0
+        means = sums / counts.clamp(min=1)[:, None]
+        if empty.any():
+            means[empty] = samples[torch.randint(len(samples), (int(empty.sum()),), generator=generator)]
+    return means
+
+
+def pca(samples: Tensor, dimensions: int, whiten: bool) -> tuple[Tensor, Tensor]:
+    """(M, N) -> weight (D, N) and bias (D,) of the projection to the leading principal directions.
+
+    Whitened directions are floored at a thousandth of the leading variance, so that noise is not blown up.
+    Raises ModelError for fewer samples than dimensions.
+    """
+    if len(samples) <= dimensions or samples.shape[1] < dimensions:
+        raise ModelError(
+            f"{len(samples)} samples of {samples.shape[1]} values cannot fit {dimensions} dimensions; "
+            f"allowed: at most {min(len(samples) - 1, samples.shape[1])}"
+        )
+    mean = samples.mean(0)
+    if len(samples) < samples.shape[1]:  # the smaller of the two Gram matrices has the same spectrum
+        centred = (samples - mean).double()
+        values, vectors = torch.linalg.eigh(centred @ centred.T)
+        directions = F.normalize(centred.T @ vectors.flip(1)[:, :dimensions], dim=0).T
+    else:
+        chunks = ((chunk - mean).double() for chunk in samples.split(4096))
+        values, vectors = torch.linalg.eigh(sum(chunk.T @ chunk for chunk in chunks))
+        directions = vectors.flip(1)[:, :dimensions].T
+    variance = values.flip(0)[:dimensions] / (len(samples) - 1)
+    if whiten:
+        directions = directions / variance.clamp(min=float(variance[0]) * 1e-3).sqrt()[:, None]
+    weight = directions.float()
+    return weight, -(weight @ mean)
+
+
+def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
+    """No progress bar."""
+    return items
+
+
+@torch.no_grad()
+def maps_of(trunk: Trunk, path: Path, options: FitOptions) -> tuple[Tensor, Tensor]:
+    """The trunk's maps (1, C, h, w) and (1, W, h, w) of an image file, on the device of the trunk."""
+    device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
+    features, wide = trunk.maps(as_batch([read_rgb(path, options.image_width, options.image_height)], device))
+    return features.float(), wide.float()
+
+
+def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
+    """The feature map (1, C, h, w) of an image file."""
+    return maps_of(trunk, path, options)[0]
+
+
+@torch.no_grad()
+def local_samples(maps: Iterable[Tensor], options: FitOptions) -> Tensor:
+    """Unit local features (M, C) drawn from feature maps (1, C, h, w) or (C, h, w)."""
+    generator = torch.Generator().manual_seed(options.seed)
+    drawn = []
+    for features in maps:
+        cells = features.flatten(-2).flatten(0, -2).T.float().cpu()  # (N, C)
+        cells = F.normalize(cells[torch.randperm(len(cells), generator=generator)[: options.cells_per_image]], dim=1)
+        drawn.append(cells[cells.any(1)])
+    return torch.cat(drawn)
+
+
+@torch.no_grad()
+def vocabulary_of(maps: Iterable[Tensor], options: FitOptions) -> NetVLAD:
+    """A NetVLAD layer from feature maps: clusters by spherical k-means, assignment by the alpha rule."""
+    samples = local_samples(maps, options)
+    netvlad = NetVLAD(options.clusters, samples.shape[1])
+    centroids = spherical_kmeans(samples, options.clusters, torch.Generator().manual_seed(options.seed))
+    netvlad.load_state_dict({"centroids": centroids, "assignment": alpha_rule(centroids, samples)})
+    return netvlad
+
+
+@torch.no_grad()
+def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions) -> tuple[Projection, Projection]:
+    """The global and the patch projection by PCA over the maps' VLADs and over patches of every size."""
+    generator = torch.Generator().manual_seed(options.seed + 1)
+    whole, parts = [], []
+    for features in maps:
+        features = features.reshape(1, *features.shape[-3:]).float().cpu()
+        x, weights = netvlad.soft_assign(features)
+        whole.append(netvlad.vlad(x, weights)[0])
+        shape = (features.shape[-2], features.shape[-1])
+        for size in options.patch_sizes:
+            vlads = patch_vlads(x[0], weights[0], netvlad.centroids, shape, size)
+            count = max(1, options.patches_per_image // len(options.patch_sizes))
+            parts.append(vlads[torch.randperm(len(vlads), generator=generator)[:count]])
+    most = len(whole) // SAMPLES_PER_DIMENSION if options.whiten else len(whole) - 1
+    return (
+        _projection(
+            *pca(torch.stack(whole), max(1, min(options.global_dim - options.pooled_dim, most)), options.whiten)
+        ),
+        _projection(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
+    )
+
+
+@torch.no_grad()
+def pooled_projection_of(maps: Iterable[Tensor], options: FitOptions) -> Projection:
+    """The projection of the generalised means of maps (W, h, w), by PCA."""
+    pooled = torch.cat([gem(m[None].float()) for m in maps])
+    return _projection(*pca(pooled, options.pooled_dim, options.whiten))
+
+
+def fit_vocabulary(
+    trunk: Trunk, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
+) -> NetVLAD:
+    """A NetVLAD layer from image files."""
+    return vocabulary_of((features_of(trunk, file, options) for file in progress(files, "vocabulary")), options)
+
+
+@torch.no_grad()
+def adapted_projection(projection: Projection, vlads: Tensor, shrinkage: float = SHRINKAGE) -> Projection:
+    """A trained projection centred and gently whitened on the images' VLADs (M, K * C); D stays.
+
+    The covariance of what it gives is shrunk towards a multiple of the identity before its inverse root is taken.
+    """
+    projected = F.linear(vlads, projection.weight, projection.bias)
+    mean = projected.mean(0)
+    covariance = torch.cov(projected.T.double())
+    level = covariance.trace() / len(covariance)
+    shrunk = (1 - shrinkage) * covariance + shrinkage * level * torch.eye(len(covariance), dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(shrunk / level)
+    whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
+    return _projection(whitening @ projection.weight, whitening @ (projection.bias - mean))
+
+
+@torch.no_grad()
+def adapt_model(model: Model, files: Sequence[Path], progress: Progress = plain_progress) -> Model:
+    """The model with its global projection adapted to the images; trunk, vocabulary and patches stay as trained.
+
+    Raises ModelError for fewer than eight images.
+    """
+    if len(files) < 8:
+        raise ModelError(f"{len(files)} images are too few to adapt to; allowed: 8 or more")
+    options = FitOptions(image_width=model.info.image_width, image_height=model.info.image_height)
+    model.trunk.eval()
+    vlads, pooled = [], []
+    for file in progress(files, "projection"):
+        features, wide = maps_of(model.trunk, file, options)
+        vlads.append(model.netvlad(features.cpu())[0])
+        pooled.append(gem(wide.cpu())[0])
+    whole = adapted_projection(model.global_projection, torch.stack(vlads))
+    beside = model.pooled_projection and adapted_projection(model.pooled_projection, torch.stack(pooled))
+    return replace(model, global_projection=whole, patch_projection=model.patches_projection, pooled_projection=beside)
+
+
+def fit_model(
+    trunk: Trunk, info: ModelInfo, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
+) -> Model:
+    """A whole model around a ready trunk. `global_dim` falls to what the number of images can fill."""
+    trunk.eval()
+    if min(options.image_width, options.image_height) < CELL * max(options.patch_sizes):
+        raise ModelError(
+            f"patch sizes {options.patch_sizes} exceed an image of {options.image_width}x{options.image_height}; "
+            f"allowed: 1 to {min(options.image_width, options.image_height) // CELL}"
+        )
+    netvlad = fit_vocabulary(trunk, files, options, progress)
+    maps = (features_of(trunk, file, options) for file in progress(files, "projections"))
+    whole, parts = projections_of(netvlad, maps, options)
+    info = replace(
+        info,
+        image_width=options.image_width,
+        image_height=options.image_height,
+        patch_sizes=options.patch_sizes,
+        patch_weights=options.patch_weights,
+    )
+    return Model(info, trunk, netvlad, whole, parts)
+
+
+def _projection(weight: Tensor, bias: Tensor) -> Projection:
+    projection = Projection(weight.shape[1], weight.shape[0])
+    projection.load_state_dict({"weight": weight, "bias": bias})
+    return projection

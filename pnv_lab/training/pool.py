@@ -1,0 +1,88 @@
+"""A pool of views, rendered once and kept as the maps of the trunk's frozen layers: training without a GPU.
+
+The frozen layers and the rendering are most of a step's work and give the same for a view every time.
+N views, C' channels after the frozen layers, h x w cells.
+"""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.files import atomic_write
+from pnv_lab.training.batches import Batch, Origin, PlaceBatches, assembled
+
+
+class FeaturePool:
+    """`groups` renderings of `batches`, on disk in `folder` (float16); building goes on where it was broken off.
+
+    Training batch n draws `places` places from it, neighbours together, and `views` of their views.
+    """
+
+    def __init__(self, folder: Path, batches: PlaceBatches, groups: int, places: int, views: int) -> None:
+        self.folder, self.batches, self.groups = folder, batches, groups
+        self.places, self.views = places, views
+        self.origins: list[list[Origin]] = []
+
+    def build(self, trunk: CompactTrunk, layers: int, progress: Iterable[int] | None = None) -> None:
+        """Render what is missing and pass it through the first `layers` of the trunk."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        done = self.folder / "done.json"
+        ready = int(json.loads(done.read_text())) if done.exists() else 0
+        for number in progress or range(self.groups):
+            if number < ready:
+                self.origins.append(self.batches.origins(number))
+                continue
+            origins, views = self.batches.render(number)
+            images = torch.from_numpy(np.stack([v.pixels for v in views])).permute(0, 3, 1, 2).float() / 255
+            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+                maps = trunk.front(images.contiguous(memory_format=torch.channels_last), layers)
+            if not hasattr(self, "maps"):
+                self._open(tuple(maps.shape[1:]))
+            rows = slice(number * len(views), (number + 1) * len(views))
+            self.maps[rows] = maps.half().contiguous().numpy()
+            self.coordinates[rows] = np.stack([v.coordinates for v in views])
+            self.origins.append(origins)
+            with atomic_write(done) as file:
+                file.write(json.dumps(number + 1).encode())
+        if not hasattr(self, "maps"):
+            self._open(tuple(json.loads((self.folder / "shape.json").read_text())))
+
+    def _open(self, shape: tuple[int, ...]) -> None:
+        with atomic_write(self.folder / "shape.json") as file:
+            file.write(json.dumps(shape).encode())
+        count = self.groups * self.batches.options.places * self.batches.options.views
+        self.maps = _array(self.folder / "maps.npy", (count, *shape))
+        self.coordinates = _array(self.folder / "coordinates.npy", (count, *shape[1:], 3))
+
+    def mild_maps(self, most: int = 1500) -> Iterable[Tensor]:
+        """The first views of at most so many places, evenly drawn: (C', h, w) each."""
+        views = self.batches.options.views
+        places = len(self.maps) // views
+        for row in views * np.unique(np.linspace(0, places - 1, min(most, places)).astype(int)):
+            yield torch.from_numpy(np.asarray(self.maps[row]))
+
+    def __getitem__(self, number: int) -> Batch:
+        o = self.batches.options
+        rng = np.random.default_rng([o.seed, 1, number])
+        clusters = o.places // o.neighbours
+        chosen = rng.choice(self.groups * clusters, self.places // o.neighbours, replace=False)
+        rows = []
+        for cluster in chosen:
+            group, first = divmod(int(cluster), clusters)
+            for place in range(o.neighbours):
+                base = (group * o.places + first * o.neighbours + place) * o.views
+                rows += [base, *(base + 1 + rng.permutation(o.views - 1)[: self.views - 1])]
+        per_group = o.places * o.views
+        origins = [self.origins[r // per_group][r % per_group] for r in rows]
+        return assembled(origins, torch.from_numpy(self.maps[rows]), [self.coordinates[r] for r in rows])
+
+
+def _array(path: Path, shape: tuple[int, ...]) -> np.ndarray:
+    if path.exists():
+        return np.lib.format.open_memmap(path, mode="r+")
+    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape)

@@ -1,0 +1,151 @@
+"""The score as a probability: fitting, judging by hand-computed figures, and living in a model file."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pnv_core.config import Config
+from pnv_core.decide.calibration import (
+    CONSERVATIVE,
+    Calibration,
+    Logistic,
+    calibration_for,
+    fit_calibration,
+    reliability,
+    threshold_for_precision,
+    write_calibration,
+)
+from pnv_core.describe.model_files import load_model, save_model
+from pnv_core.errors import ModelError
+from pnv_core.types import Evidence
+from test.core.small import small_model
+
+CONFIG = Config.make(
+    image_width=320, image_height=240, patch_sizes=(2, 3), patch_strides=(1, 1), patch_weights=(0.5, 0.5)
+)
+
+
+def drawn(rng, n, examined=True):
+    """Evidence whose truth follows a logistic law in local inliers and spatial score."""
+    found = []
+    for _ in range(n):
+        inliers, spatial = int(rng.integers(8, 60)), float(rng.uniform(0.02, 0.4))
+        logit = -5.0 + 3.0 * np.log(inliers / 8) + 1.0 * (np.log(spatial) + 3)
+        e = Evidence(0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_spread=0.2)
+        found.append((e, bool(rng.random() < 1 / (1 + np.exp(-logit))), 1 / (1 + np.exp(-logit))))
+    return found
+
+
+def test_the_fit_finds_the_probability_the_examples_were_drawn_with():
+    rng = np.random.default_rng(0)
+    examples = drawn(rng, 6000)
+    fitted = fit_calibration([(e, t) for e, t, _ in examples], np.ones(6000), CONFIG, "drawn")
+    fresh = drawn(rng, 500)
+    error = [abs(fitted.probability(e) - p) for e, _, p in fresh]
+    assert np.mean(error) < 0.03
+    assert fitted.suits(CONFIG)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.sampled_from(
+        [f.name for f in dataclasses.fields(Evidence) if f.name not in ("texture", "distortion", "inliers")]
+    ),
+    st.floats(0, 1),
+    st.integers(0, 3),
+)
+def test_more_of_any_evidence_never_lowers_the_score(name, step, seed):
+    rng = np.random.default_rng(seed)
+    examples = [(e, t) for e, t, _ in drawn(rng, 200)]
+    fitted = fit_calibration(examples, np.ones(200), CONFIG, "")
+    e = examples[0][0]
+    more = round(step * 40) if name == "local_inliers" else step
+    raised = dataclasses.replace(e, **{name: getattr(e, name) + more})
+    for calibration in (fitted, CONSERVATIVE):
+        assert calibration.probability(raised) >= calibration.probability(e) - 1e-12
+        assert calibration.probability(dataclasses.replace(e, distortion=e.distortion + step)) <= (
+            calibration.probability(e) + 1e-12
+        )
+
+
+def test_an_unknown_model_believes_no_candidate_on_its_patches_alone():
+    for spatial in (0.0, 0.1, 0.3, 0.6):
+        assert CONSERVATIVE.probability(Evidence(0.9, spatial, 200, 1.0, 0.0)) < 0.5
+    assert CONSERVATIVE.probability(Evidence(0.5, 0.1, 50, 0.5, 0.3, local_inliers=8)) < 0.05
+    assert CONSERVATIVE.probability(Evidence(0.5, 0.15, 50, 0.5, 0.3, local_inliers=40)) > 0.9
+
+
+def test_expected_calibration_error_by_hand():
+    scores = np.array([0.05, 0.05, 0.92, 0.98, 0.98, 0.98])
+    truth = np.array([0, 1, 1, 1, 1, 0], bool)
+    diagram = reliability(scores, truth)
+    assert list(diagram.count) == [2, 4]
+    # bins: mean 0.05 against 1/2, mean 0.965 against 3/4
+    assert diagram.expected_error == pytest.approx((2 * 0.45 + 4 * 0.215) / 6)
+
+
+def test_a_score_of_one_lies_in_the_last_bin_and_no_candidate_has_no_error():
+    assert list(reliability(np.array([1.0, 1.0]), np.array([True, True])).count) == [2]
+    assert reliability(np.zeros(0), np.zeros(0, bool)).expected_error == 0.0
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0.1, 0.3, 0.5, 0.7, 0.9]), st.booleans()), max_size=40), st.floats(0.05, 1.0)
+)
+def test_the_threshold_is_that_of_a_plain_search(pairs, precision):
+    scores = np.array([s for s, _ in pairs])
+    truth = np.array([t for _, t in pairs], bool)
+    found = threshold_for_precision(scores, truth, precision)
+    reaching = [s for s in set(scores) if truth[scores >= s].mean() >= precision]
+    if reaching:
+        assert found == min(reaching)
+    else:
+        assert found > 1.0
+
+
+def test_a_fit_needs_true_and_false_examples():
+    examples = [(e, True) for e, _, _ in drawn(np.random.default_rng(0), 10)]
+    with pytest.raises(ModelError, match="some true and some false"):
+        fit_calibration(examples, np.ones(10), CONFIG, "")
+
+
+def test_the_calibration_lives_in_the_model_file_and_leaves_the_model_as_it_is(tmp_path):
+    path = tmp_path / "model.safetensors"
+    save_model(small_model(), path)
+    before = load_model(path)
+    calibration = Calibration(
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"local_inliers": 3.0}), "ransac", (2, 3), (320, 240), "a test"
+    )
+    write_calibration(path, calibration)
+    after = load_model(path)
+    assert after.fingerprint() == before.fingerprint()
+    assert Calibration.from_json(after.info.calibration) == calibration
+    assert calibration_for(after.info.calibration, CONFIG) == calibration
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
+    stored = Calibration(Logistic(0.0, {}), Logistic(0.0, {}), "ransac", (2, 3), (320, 240), "").to_json()
+    assert calibration_for(stored, CONFIG) is not CONSERVATIVE
+    assert calibration_for(stored, CONFIG.replace(scorer="rapid")) is CONSERVATIVE
+    assert calibration_for(stored, CONFIG.replace(image_width=640)) is CONSERVATIVE
+    assert calibration_for(None, CONFIG) is CONSERVATIVE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"patches": {"bias": 0.0, "weights": {"spatial": -1.0}}},
+        {"patches": {"bias": 0.0, "weights": {"colour": 1.0}}},
+        {"patches": {"bias": float("nan"), "weights": {}}},
+        {"verified": None},
+        {"image_size": [320]},
+    ],
+)
+def test_a_malformed_calibration_is_refused(change):
+    good = Calibration(Logistic(0.0, {}), Logistic(0.0, {}), "ransac", (2,), (320, 240), "").to_json()
+    with pytest.raises(ModelError, match="calibration"):
+        Calibration.from_json(good | change)

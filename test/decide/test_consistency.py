@@ -1,0 +1,99 @@
+"""Which closures agreement in time confirms, on sequences made by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
+from pnv_core.types import ImageRef, LoopClosure
+
+WANTED = 3
+
+
+def closure(query, match, score=0.9, session=0, camera="front"):
+    here, there = ImageRef(query, query * 10**9, "front", session), ImageRef(match, match * 10**9, camera)
+    return LoopClosure(here, there, score, 0.5, 0.5, 50, False)
+
+
+def confirmations(found, wanted=WANTED):
+    """found: per query keyframe a list of (match, score). Which queries have a confirmed best closure."""
+    memory, verdicts = SequenceMemory(), []
+    for query, matches in enumerate(found, start=1000):
+        closures = [closure(query, m, s) for m, s in matches]
+        memory.remember("front", closures, window_of(wanted))
+        verdicts.append(bool(closures) and confirmed(memory.path(closures[0], window_of(wanted)), wanted))
+    return verdicts
+
+
+def single(*matches):
+    return [[] if m is None else [(m, 0.9)] for m in matches]
+
+
+def test_a_way_taken_again_is_confirmed_from_the_third_keyframe_on():
+    assert confirmations(single(10, 11, 12, 13, 14)) == [False, False, True, True, True]
+
+
+def test_a_way_taken_backwards_is_confirmed():
+    assert confirmations(single(30, 28, 27, 25)) == [False, False, True, True]
+
+
+def test_a_slower_and_a_faster_robot_are_confirmed():
+    assert confirmations(single(10, 10, 11, 11, 12))[-1]
+    assert confirmations(single(10, 15, 20, 26))[-1]
+
+
+def test_one_query_without_a_match_does_not_break_the_way():
+    assert confirmations(single(10, 11, None, 13, 14))[-2:] == [True, True]
+
+
+def test_a_lonely_match_and_scattered_matches_are_not_confirmed():
+    assert not any(confirmations(single(10, None, None, None, 40)))
+    assert not any(confirmations(single(10, 80, 30, 170, 55, 120)))
+
+
+def test_matches_that_go_to_and_fro_are_not_confirmed():
+    assert not any(confirmations(single(10, 16, 11, 17, 12), wanted=4))
+
+
+def test_the_same_keyframe_again_and_again_is_one_witness():
+    assert not any(confirmations(single(*[10] * 50)))
+
+
+def test_a_second_place_on_the_way_is_found_behind_a_better_looking_one():
+    found = [[(10, 0.5)], [(90, 0.9), (11, 0.5)], [(12, 0.5), (40, 0.4)]]
+    assert confirmations(found)[-1]
+
+
+def test_weak_candidates_support_nothing():
+    assert not any(confirmations([[(10, 0.01)], [(11, 0.01)], [(12, 0.9)]]))
+
+
+def test_matches_of_another_session_or_camera_do_not_support():
+    memory = SequenceMemory()
+    for query, (match, camera) in enumerate([(10, "rear"), (11, "rear"), (12, "front")], start=100):
+        memory.remember("front", [closure(query, match, camera=camera)], window_of(WANTED))
+    assert memory.path(closure(102, 12), window_of(WANTED)).length == 1
+
+
+@pytest.mark.parametrize("wanted", [0, 1])
+def test_nothing_is_wanted_where_consistency_is_off(wanted):
+    assert confirmations(single(10, 80), wanted) == [True, True]
+
+
+@given(st.lists(st.lists(st.tuples(st.integers(0, 400), st.floats(0, 1)), max_size=5), max_size=30), st.integers(2, 6))
+def test_a_path_is_never_longer_than_its_window_and_never_counts_a_query_twice(found, wanted):
+    memory = SequenceMemory()
+    for query, matches in enumerate(found, start=1000):
+        closures = [closure(query, m, s) for m, s in matches]
+        memory.remember("front", closures, window_of(wanted))
+        for c in closures:
+            path = memory.path(c, window_of(wanted))
+            assert 1 <= path.length <= window_of(wanted)
+            assert 0 <= path.score <= 1
+
+
+def test_chance_matches_are_hardly_ever_confirmed():
+    """A thousand queries with a random match each among 1000 keyframes: the share confirmed stays under 1 %."""
+    rng = np.random.default_rng(0)
+    assert np.mean(confirmations(single(*rng.integers(0, 1000, 1000)))) < 0.01

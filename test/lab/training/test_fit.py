@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from pnv_core.describe.model_files import ModelInfo, load_model, make_trunk, save_model
+from pnv_core.describe.netvlad import Projection, alpha_rule
+from pnv_core.errors import ModelError
+from pnv_lab.fit import FitOptions, adapted_projection, fit_model, image_files, pca, spherical_kmeans
+
+
+def test_kmeans_finds_directions_that_are_there():
+    generator = torch.Generator().manual_seed(0)
+    true = F.normalize(torch.randn(5, 20, generator=generator), dim=1)
+    samples = F.normalize(true.repeat(60, 1) + 0.05 * torch.randn(300, 20, generator=generator), dim=1)
+    found = F.normalize(spherical_kmeans(samples, 5, generator), dim=1)
+    assert (found @ true.T).amax(0).min() > 0.99
+
+
+def test_alpha_rule_leaves_a_hundredth_to_the_second_best_cluster():
+    samples = F.normalize(torch.randn(500, 8, generator=torch.Generator().manual_seed(1)), dim=1)
+    logits = samples @ alpha_rule(samples[:6] * 0.9, samples).T
+    top = torch.softmax(logits, dim=1).topk(2, dim=1).values
+    assert torch.log(top[:, 1] / top[:, 0]).mean().item() == pytest.approx(np.log(0.01), rel=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(400, 30), (40, 90)])
+def test_whitened_pca_has_unit_variance_and_plain_pca_keeps_lengths(shape):
+    samples = torch.randn(shape, generator=torch.Generator().manual_seed(2)) * torch.linspace(1, 3, shape[1]) + 5
+    weight, bias = pca(samples, 10, whiten=True)
+    whitened = samples @ weight.T + bias
+    assert torch.allclose(torch.cov(whitened.T), torch.eye(10), atol=1e-3)
+    weight, _ = pca(samples, 10, whiten=False)
+    assert torch.allclose(weight @ weight.T, torch.eye(10), atol=1e-4)
+
+
+def test_too_few_samples_are_refused_by_number():
+    with pytest.raises(ModelError, match="5 samples .* 10 dimensions; allowed: at most 4"):
+        pca(torch.randn(5, 20), 10, whiten=True)
+
+
+def test_a_rootsift_model_is_fitted_saved_and_loaded(picture_folder, tmp_path):
+    options = FitOptions(
+        clusters=4,
+        global_dim=3,
+        patch_dim=6,
+        image_width=128,
+        image_height=96,
+        patch_sizes=(2, 3),
+        patch_weights=(0.5, 0.5),
+    )
+    model = fit_model(make_trunk("rootsift", {}), ModelInfo("rootsift"), image_files([picture_folder]), options)
+    save_model(model, tmp_path / "m.safetensors")
+    again = load_model(tmp_path / "m.safetensors")
+    assert (again.netvlad.clusters, again.global_dim, again.patch_dim) == (4, 3, 6)
+    assert again.info.patch_sizes == (2, 3)
+
+
+def test_adapting_without_shrinkage_whitens_and_with_full_shrinkage_only_centres():
+    samples = torch.randn(200, 6, generator=torch.Generator().manual_seed(4)) * torch.tensor([5.0, 3, 1, 1, 1, 1]) + 2
+    identity = Projection(6, 6)
+    identity.load_state_dict({"weight": torch.eye(6), "bias": torch.zeros(6)})
+    white = adapted_projection(identity, samples, shrinkage=0.0)
+    covariance = torch.cov((samples @ white.weight.T + white.bias).T)
+    assert torch.allclose(covariance, covariance[0, 0] * torch.eye(6), atol=1e-2 * covariance[0, 0].item())
+    centred = adapted_projection(identity, samples, shrinkage=1.0)
+    assert torch.allclose(centred.weight, torch.eye(6), atol=1e-5)
+    assert torch.allclose(centred.bias, -samples.mean(0), atol=1e-5)

@@ -1,0 +1,90 @@
+"""Local features on drawn pictures: views of one scene agree, of others do not."""
+
+import cv2
+import numpy as np
+import pytest
+
+from pnv_core.verify.local_features import Verifier, detect, epipolar_check, thumbnail
+
+
+def scene(seed, size=(480, 640)):
+    """A picture full of random shapes."""
+    rng = np.random.default_rng(seed)
+    image = np.full((*size, 3), 128, np.uint8)
+    for _ in range(150):
+        centre = tuple(int(v) for v in rng.integers(0, (size[1], size[0])))
+        colour = tuple(int(v) for v in rng.integers(0, 256, 3))
+        axes = tuple(int(v) for v in rng.integers(5, 40, 2))
+        cv2.ellipse(image, centre, axes, float(rng.uniform(0, 180)), 0, 360, colour, -1)
+    return image
+
+
+def view(image, shift, scale):
+    matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], np.float32)
+    return cv2.warpAffine(image, matrix, image.shape[1::-1], borderMode=cv2.BORDER_REFLECT)
+
+
+def features(image, valid=None):
+    return detect(thumbnail(image), valid)
+
+
+def test_two_views_of_one_scene_agree_and_their_points_are_where_the_views_put_them():
+    image = scene(0)
+    check = epipolar_check(features(image), features(view(image, (30, -20), 1.1)), 0.75)
+    assert check.inliers > 60
+    assert check.spread > 0.3
+    expected = check.query * 1.1 + np.array([30, -20]) / 640
+    error = np.linalg.norm(expected - check.reference, axis=1)[check.inlier]
+    assert np.median(error) < 1.0 / 320  # a thumbnail pixel
+
+
+def test_other_scenes_agree_by_chance_only():
+    for seed in range(5):
+        assert epipolar_check(features(scene(seed)), features(scene(seed + 50)), 0.75).inliers <= 12
+
+
+def test_a_blank_picture_has_no_features_and_agrees_with_nothing():
+    blank = np.full((480, 640, 3), 90, np.uint8)
+    assert len(features(blank).points) == 0
+    assert epipolar_check(features(blank), features(scene(0)), 0.75).inliers == 0
+    assert epipolar_check(features(blank), features(blank), 0.75).spread == 0.0
+
+
+def test_a_damaged_picture_of_a_map_agrees_with_nothing():
+    damaged = b"\xff\xd8\xff no picture"
+    assert Verifier().check(thumbnail(scene(0)), "front", damaged, "front").inliers == 0
+
+
+def test_a_repeated_pattern_is_no_evidence():
+    tile = scene(3, (48, 64))
+    tiled = np.tile(tile, (10, 10, 1))
+    other = np.roll(tiled, (17, 23), axis=(0, 1))
+    assert epipolar_check(features(tiled), features(other), 0.75).inliers <= 20
+
+
+def test_the_robots_own_body_is_no_evidence():
+    body = scene(9)[240:]
+    one, other = scene(1), scene(2)
+    one[240:], other[240:] = body, body
+    valid = np.ones(one.shape[:2], bool)
+    assert epipolar_check(features(one), features(other), 0.75).inliers > 30
+    valid[240:] = False
+    verifier = Verifier()
+    verifier.mask("front", valid)
+    assert verifier.check(thumbnail(one), "front", thumbnail(other), "front").inliers <= 12
+
+
+def test_a_thumbnail_is_small_grey_and_of_the_same_aspect():
+    picture = thumbnail(scene(0, (360, 640)))
+    assert len(picture) < 20_000
+    assert cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_UNCHANGED).shape == (180, 320)
+    assert cv2.imdecode(np.frombuffer(thumbnail(scene(0, (60, 80))), np.uint8), cv2.IMREAD_UNCHANGED).shape == (60, 80)
+
+
+@pytest.mark.parametrize("shape", [(16384, 16), (20000, 1), (1, 1), (16, 16384), (70000, 2)])
+def test_a_sliver_of_an_image_stays_small(shape):
+    """Its picture at 320 pixels width would have up to 6.4 million rows; features are looked for in at most 1280."""
+    rgb = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
+    picture = cv2.imdecode(np.frombuffer(thumbnail(rgb), np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert picture.size <= 320 * 1280
+    assert (detect(thumbnail(rgb)).points <= 4.0).all()
