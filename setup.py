@@ -35,6 +35,7 @@ DEVELOPMENT = [
     "rosbags-image>=0.10",  # an independent decoder to test against; it knows neither row padding nor size limits
     "ruff>=0.6",
     "mypy>=1.11",
+    "import-linter>=2.1",  # the contract over who imports whom, in pyproject.toml
     "matplotlib>=3.8",
     "pyyaml>=6",
     "colcon-common-extensions>=0.3",

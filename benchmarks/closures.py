@@ -89,7 +89,7 @@ def judged(images: TruthSequence, describer: Describer, cache: Path, **settings)
     config = describer.config.replace(exclude_recent_s=images.exclude_recent_s, **settings)
     remembered = RememberedDescriber(describer, images, cache)
     remembered.config = config
-    recognizer = PlaceRecognizer(config, remembered)  # type: ignore[arg-type]
+    recognizer = PlaceRecognizer(remembered)  # type: ignore[arg-type]
     image_of: dict[int, int] = {}
     queries, loops = [], []
     for i, frame in enumerate(images.frames()):

@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     config = config_from(args)
     source = source_of(args)
     timer = StageTimer(time.perf_counter)
-    recognizer = PlaceRecognizer(config, describer_from(config), timer=timer)
+    recognizer = PlaceRecognizer(describer_from(config), timer=timer)
     if recognizer.judge.calibration is CONSERVATIVE:
         print("pnv: no calibration fits this model and these settings: a conservative score decides", file=sys.stderr)
     recorder = _recorder(recognizer) if report else None

@@ -178,3 +178,8 @@ class Config:
 
     def replace(self, **changes: Any) -> "Config":
         return dataclasses.replace(self, **changes)
+
+
+def live_settings(config: Config) -> dict[str, Any]:
+    """The settings that may change while running, with their values."""
+    return {name: getattr(config, name) for name, declared in settings_of(Config).items() if declared.live}

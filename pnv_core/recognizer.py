@@ -1,40 +1,41 @@
 """PlaceRecognizer: one frame in, its loop-closure candidates out. Deterministic, no clock, no ROS."""
 
 from dataclasses import replace
+from typing import Any
 
-from pnv_core.config import Config
+from pnv_core.config import live_settings
 from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
 from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
 from pnv_core.decide.judge import Judge
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
+from pnv_core.errors import ConfigError
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, Reason
 from pnv_core.verify.local_features import thumbnail
 
 
 class PlaceRecognizer:
-    """Patch-NetVLAD over a rolling keyframe database.
+    """Patch-NetVLAD over a rolling keyframe database, with the settings that its describer was built with.
 
     The same frames in the same order give the same closures, live, from a bag or in a test.
     """
 
     def __init__(
         self,
-        config: Config,
         describer: Describer,
         database: KeyframeDatabase | None = None,
         timer: StageTimer | None = None,
     ) -> None:
-        self.config = config
+        self.config = describer.config  # the one Config; only its live settings change, by `change`
         self.describer = describer
         if database is None:  # an empty one is false
             database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
         self.database = database
         self.timer = timer or StageTimer()
         self.budget = TimeBudget(self.timer.clock)
-        self.keyframes = KeyframeSelector(config)
+        self.keyframes = KeyframeSelector(self.config)
         self.judge = Judge(describer.config, describer.model.info.calibration)
         self.sequence = SequenceMemory()
         self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
@@ -74,9 +75,13 @@ class PlaceRecognizer:
         self.sequence.remember(frame.camera, closures, window_of(self.config.consistency))
         return [self._decided(c) for c in closures]
 
-    def change(self, config: Config) -> None:
-        """Take the live settings of another Config, from the next frame on."""
-        self.config = self.keyframes.config = config
+    def change(self, **live: Any) -> None:
+        """Take these live settings from the next frame on. Raises ConfigError for others and for a wrong value."""
+        if fixed := [name for name in live if name not in live_settings(self.config)]:
+            raise ConfigError(
+                f"{', '.join(fixed)} cannot change while running; allowed: {', '.join(live_settings(self.config))}"
+            )
+        self.config = self.keyframes.config = self.config.replace(**live)
 
     def new_session(self) -> None:
         """What comes next is another run: its stamps may lie before those already seen."""

@@ -32,7 +32,7 @@ def gathered(describer: Describer, frames: Iterable[tuple[str, Frame]], truth: T
     """Every candidate of a sequence whose truth is known. `recent_s` is the exclusion window while gathering."""
     config = describer.config
     config = config.replace(exclude_recent_s=recent_s, consistency=0, verify=min(100, config.candidates))
-    recognizer = PlaceRecognizer(config, describer)
+    recognizer = PlaceRecognizer(Describer(describer.model, config))
     names: dict[tuple[str, int], str] = {}
     evidence, true = [], []
     for name, frame in frames:

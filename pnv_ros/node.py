@@ -174,7 +174,7 @@ class PlaceRecognizerNode(LifecycleNode):
         database = KeyframeDatabase.from_config(
             describer.config, describer.model.global_dim, read_only=config.read_only
         )
-        recognizer = PlaceRecognizer(self.settings.recogniser, describer, database, timer=StageTimer(time.perf_counter))
+        recognizer = PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
         per_keyframe = database.bytes_per_keyframe(_warm_up(describer))
         if per_keyframe > database.bytes_budget:
             raise ConfigError(

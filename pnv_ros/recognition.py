@@ -8,6 +8,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 
 from msg_adapters.images import message_to_frame
+from pnv_core.config import live_settings
 from pnv_core.errors import ImageError
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, LoopClosure
@@ -71,7 +72,7 @@ class Recognition:
             wanted = self._wanted
             if wanted is not None and wanted is not self._taken:
                 self._taken = wanted
-                self.recognizer.change(wanted.recogniser)
+                self.recognizer.change(**live_settings(wanted.recogniser))
                 self.outputs.config = wanted.node
             if waiting.session < self._session:  # waited here while another camera began a new session
                 self._statistics.drop(Drop.STAMP_BACK)

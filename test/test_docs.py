@@ -84,7 +84,7 @@ def given_names() -> dict[str, object]:
     """What the documentation's Python takes for granted."""
     frames = [(i * 40 * 10**9, np.asarray(place(i % 2))) for i in range(4)]
     describer = load_describer()
-    recognizer = PlaceRecognizer(Config(), describer)
+    recognizer = PlaceRecognizer(describer)
     closures = [c for stamp, rgb in frames for c in recognizer.process(Frame(stamp, "/camera/image_raw", rgb))]
     MapStore("office.map", describer.map_fingerprint).save(recognizer.database.snapshot())
     camera = {"fx": 300.0, "fy": 300.0, "cx": 80.0, "cy": 60.0, "width": 160}

@@ -77,7 +77,7 @@ def recorded(walk: Walk, odometry: Array) -> Recording:
     parser = argparse.ArgumentParser()
     add_source_flags(parser)
     describer = load_describer("default", **walk.parameters)
-    recognizer = PlaceRecognizer(describer.config, describer)
+    recognizer = PlaceRecognizer(describer)
     relative, recording = RelativePoses(recognizer), Recording()
     positions = dict(zip(walk.stamps_ns, odometry[:, :3, 3], strict=True))
     for _, frame in named_frames(parser.parse_args(walk.flags)):

@@ -271,7 +271,7 @@ def test_a_time_budget_allows_as_many_candidates_as_fit():
 def test_candidates_beyond_the_budget_are_reported_as_not_re_ranked():
     describer = small_describer(min_interval_s=0.0, min_change=0.0, exclude_recent_s=0.0, time_budget_ms=110.0)
     clock = Clock()
-    recogniser = PlaceRecognizer(describer.config, describer, timer=StageTimer(clock))
+    recogniser = PlaceRecognizer(describer, timer=StageTimer(clock))
     scores = recogniser.judge.reranker.scores
 
     def slow(query, references):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from pnv_core.config import Config
-from pnv_core.describe.describer import describer_from
+from pnv_core.describe.describer import Describer, describer_from
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, Reason
 from test.verify.test_local_features import scene
@@ -20,7 +20,7 @@ def describer():
 
 
 def processed(describer, images, step_s=2.0, **settings):
-    recognizer = PlaceRecognizer(Config.make(threads=1, **(EAGER | settings)), describer)
+    recognizer = PlaceRecognizer(Describer(describer.model, Config.make(threads=1, **(EAGER | settings))))
     found = []
     for i, image in enumerate(images):
         found.append(recognizer.process(Frame(round(i * step_s * S), "front", image)))

@@ -1,7 +1,6 @@
 """Drives on which no place is seen twice, through the default model and settings: nothing may be confirmed."""
 
-from pnv_core.config import Config
-from pnv_core.describe.describer import describer_from
+from pnv_core.describe.describer import load_describer
 from pnv_core.images import list_images, read_image
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame
@@ -9,8 +8,7 @@ from pnv_core.types import Frame
 
 def confirmed(files, step_s):
     """(query, match) image numbers of the accepted closures."""
-    config = Config.make(exclude_recent_s=15.0)
-    recognizer = PlaceRecognizer(config, describer_from(config))
+    recognizer = PlaceRecognizer(load_describer(exclude_recent_s=15.0))
     number = {round(i * step_s * 1e9): i for i in range(len(files))}
     found = []
     for stamp, i in number.items():
