@@ -6,13 +6,14 @@ from typing import Any
 from pnv_core.config import live_settings
 from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
-from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
+from pnv_core.decide.consistency import SequenceMemory, window_of
+from pnv_core.decide.gates import decided
 from pnv_core.decide.judge import Judge
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
 from pnv_core.timing import StageTimer, TimeBudget
-from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, Reason
+from pnv_core.types import Frame, ImageRef, LoopClosure, Query
 from pnv_core.verify.local_features import thumbnail
 
 
@@ -38,6 +39,7 @@ class PlaceRecognizer:
         self.keyframes = KeyframeSelector(self.config)
         self.judge = Judge(describer.config, describer.model.info.calibration)
         self.sequence = SequenceMemory()
+        self.latest: Query | None = None  # of the last frame processed; None where it was no keyframe
         self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
 
     def process(self, frame: Frame) -> list[LoopClosure]:
@@ -45,6 +47,7 @@ class PlaceRecognizer:
 
         Empty for a frame that is no keyframe or has no candidates. Raises ImageError for an unusable image.
         """
+        self.latest = None
         if not self.keyframes.due(frame):
             return []
         self.budget.start()
@@ -71,6 +74,7 @@ class PlaceRecognizer:
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
             self.odometry.remember(query)
+        self.latest = Query(query, descriptor, predecessor, frame.valid)
         closures = [replace(c, query=query) for c in closures]
         self.sequence.remember(frame.camera, closures, window_of(self.config.consistency))
         return [self._decided(c) for c in closures]
@@ -100,20 +104,6 @@ class PlaceRecognizer:
         self.odometry.forget()
 
     def _decided(self, closure: LoopClosure) -> LoopClosure:
-        config = self.config
-        if closure.reason is Reason.NOT_RERANKED:
-            return closure
-        evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
-        if evidence.texture < config.min_texture:
-            return replace(closure, reason=Reason.LOW_TEXTURE)
-        if closure.score < config.accept_score:
-            return replace(closure, reason=Reason.LOW_SCORE)
-        if config.verify and evidence.local_inliers < 0:
-            return replace(closure, reason=Reason.NOT_VERIFIED)
-        gate = config.odometry_drift, config.odometry_slack_m, config.min_travelled_m
-        if self.odometry.impossible(closure.query, closure.match, *gate):
-            return replace(closure, reason=Reason.ODOMETRY)
-        path = self.sequence.path(closure, window_of(config.consistency))
-        if closure.score < config.sure_score and not confirmed(path, config.consistency):
-            return replace(closure, reason=Reason.UNCONFIRMED)
-        return replace(closure, accepted=True)
+        gate = self.config.odometry_drift, self.config.odometry_slack_m, self.config.min_travelled_m
+        impossible = self.odometry.impossible(closure.query, closure.match, *gate)
+        return decided(closure, self.config, self.sequence, impossible)

@@ -75,12 +75,29 @@ class PlaceDescriptor:
 
 @dataclass(frozen=True)
 class ImageRef:
-    """Which image: keyframe id (monotone, never reused; -1 for a query that is no keyframe), stamp, camera, session."""
+    """Which image: keyframe id (monotone, never reused; -1 for a query that is no keyframe), stamp, camera, session.
+
+    `robot` names another robot, or this one towards others; empty within one robot's own map.
+    """
 
     id: int
     stamp_ns: int
     camera: str
     session: int = 0
+    robot: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Query:
+    """What a keyframe is looked up with, here or by others: which it is, its descriptor, the pixels it may use.
+
+    `predecessor` is the cosine to the keyframe before it, 1 where there is none.
+    """
+
+    ref: ImageRef
+    descriptor: PlaceDescriptor
+    predecessor: float
+    valid: NDArray[np.bool_] | None = None  # as in Frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from msg_adapters.relative_pose import relative_pose_to_message
 from pnv_core.drawing import draw_match
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
+from pnv_core.verify.feature_codes import packed
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
 
@@ -92,6 +93,6 @@ class Outputs:
         return rgb_to_message(picture, frame.stamp_ns, self.config.frame_id)
 
     def _unpacked(self, picture: bytes) -> NDArray[np.uint8]:
-        if not picture:
+        if not picture or packed(picture):
             return np.full((self._size[1], self._size[0], 3), 64, np.uint8)
         return cv2.cvtColor(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2RGB)

@@ -70,7 +70,7 @@ class SequenceMemory:
 
 def _follows(earlier: ImageRef, later: ImageRef, way: int, steps: int) -> bool:
     """Whether `earlier` may be matched by the query `steps` before the one that matched `later`."""
-    same = earlier.session == later.session and earlier.camera == later.camera
+    same = (earlier.robot, earlier.session, earlier.camera) == (later.robot, later.session, later.camera)
     return same and 0 <= way * (later.id - earlier.id) <= _STEP * steps
 
 

@@ -101,7 +101,7 @@ def _rank(closure: LoopClosure) -> tuple[float, float, int]:
 
 
 def _apart(a: ImageRef, b: ImageRef) -> bool:
-    return a.session != b.session or abs(a.id - b.id) > _NEIGHBOURS
+    return (a.robot, a.session) != (b.robot, b.session) or abs(a.id - b.id) > _NEIGHBOURS
 
 
 def _inlier_points(

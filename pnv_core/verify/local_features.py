@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.threads import Workers
+from pnv_core.verify.feature_codes import pack, packed, unpack
 
 WIDTH = 320  # pixels; at this width a thumbnail takes about a tenth of a keyframe's patches
 _TALLEST = 4 * WIDTH
@@ -70,7 +71,12 @@ def _height(grey: NDArray[np.uint8]) -> int:
 
 
 def detect(picture: bytes, valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
-    """A thumbnail, optionally (H, W) bool of the image's pixels to use -> its features, at most 500."""
+    """A thumbnail, optionally (H, W) bool of the image's pixels to use -> its features, at most 500.
+
+    What `features_of` made of a thumbnail is as good as the thumbnail.
+    """
+    if packed(picture):
+        return _unpacked(picture)
     grey = _decoded(picture)
     if grey.shape[1] < WIDTH:  # a small image has details of few pixels; SIFT wants them larger
         grey = cv2.resize(grey, (WIDTH, _height(grey)), interpolation=cv2.INTER_LINEAR)
@@ -85,6 +91,32 @@ def detect(picture: bytes, valid: NDArray[np.bool_] | None = None) -> LocalFeatu
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-6))
     points = np.array([k.pt for k in keypoints], np.float32) + 0.5
     return LocalFeatures((points / WIDTH).astype(np.float32), root.astype(np.float32))
+
+
+def features_of(picture: bytes, valid: NDArray[np.bool_] | None = None) -> bytes:
+    """The features of a thumbnail in place of the thumbnail: what is compared without what people can be seen on."""
+    found = detect(picture, valid)
+    return pack(found.points, found.descriptors, _aspect(picture))
+
+
+def _unpacked(codes: bytes) -> LocalFeatures:
+    """Damaged ones show nothing, as a damaged picture does."""
+    try:
+        points, descriptors, _ = unpack(codes)
+    except ValueError:
+        points, descriptors = np.empty((0, 2), np.float32), np.empty((0, 128), np.float32)
+    return LocalFeatures(points, descriptors)
+
+
+def _aspect(picture: bytes) -> float:
+    """Height / width of a thumbnail or of the one that features are of."""
+    if packed(picture):
+        try:
+            return unpack(picture)[2]
+        except ValueError:
+            return 1.0
+    height, width = _decoded(picture).shape
+    return height / width
 
 
 def match(query: LocalFeatures, reference: LocalFeatures) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -142,11 +174,8 @@ class Verifier:
 
     def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
         """Two thumbnails and the cameras that took them."""
-        grey = _decoded(query)
         return epipolar_check(
-            self._detected(query, query_camera),
-            self._detected(reference, reference_camera),
-            grey.shape[0] / grey.shape[1],
+            self._detected(query, query_camera), self._detected(reference, reference_camera), _aspect(query)
         )
 
     def _detected(self, picture: bytes, camera: str) -> LocalFeatures:
