@@ -58,14 +58,13 @@ def stored(descriptor: PlaceDescriptor, dim: int, precision: str) -> PlaceDescri
     return replace(descriptor, patches=tuple(grids))
 
 
-def reranker_of(scorer: str, mode: str, threads: int) -> Reranker:
+def reranker_of(scorer: str, threads: int) -> Reranker:
     return Reranker(
         Config.make(
             patch_sizes=SIZES,
             patch_strides=(1, 1, 1),
             patch_weights=WEIGHTS,
             scorer=scorer,
-            match_mode=mode,
             threads=threads,
         )
     )
@@ -78,7 +77,7 @@ def winners(
     best = []
     for query, candidates in zip(queries, ranking, strict=True):
         results = reranker.scores(query, [references[i] for i in candidates])
-        best.append(candidates[int(np.argmax([-1.0 if r is None else r.score for r in results]))])
+        best.append(candidates[int(np.argmax([r.score for r in results]))])
     return np.array(best)
 
 
@@ -98,7 +97,7 @@ def examined(folder: Path, count: int, candidates: int, threads: int) -> dict:
         references = described(describer, [folder / name for name in names])
         vectors = [np.stack([d.global_vector for d in side]) for side in (queries, references)]
         ranking = np.argsort(-(vectors[0] @ vectors[1].T), axis=1, kind="stable")[:, :candidates]
-        best = winners(reranker_of("rapid", "exact", threads), queries, references, ranking)
+        best = winners(reranker_of("rapid", threads), queries, references, ranking)
         found["recall@1"][mode] = int(truth[np.arange(len(rows)), best].sum())
         if mode == "exact":
             exact = queries, references, ranking, best
@@ -116,13 +115,10 @@ def examined(folder: Path, count: int, candidates: int, threads: int) -> dict:
     queries, references, ranking, _ = exact
     for dim, scorer in ((512, "rapid"), (128, "ransac")):
         reduced = [[stored(d, dim, "float32") for d in side] for side in (queries, references)]
-        best = winners(reranker_of(scorer, "exact", threads), *reduced, ranking)
-        for mode in ("bounded", "coarse") if scorer == "ransac" else ("coarse",):
-            other = winners(reranker_of(scorer, mode, threads), *reduced, ranking)
-            found["same winner as exact"][f"{mode}, {scorer}, D={dim}"] = int((best == other).sum())
+        best = winners(reranker_of(scorer, threads), *reduced, ranking)
         for precision in ("float16", "int8"):
             kept = [stored(d, dim, precision) for d in references]
-            other = winners(reranker_of(scorer, "exact", threads), reduced[0], kept, ranking)
+            other = winners(reranker_of(scorer, threads), reduced[0], kept, ranking)
             found["same winner as exact"][f"{precision} stored, {scorer}, D={dim}"] = int((best == other).sum())
     return found
 

@@ -1,6 +1,6 @@
 """The keyframe database: retrieval at any size, memory, and saving while frames arrive.
 
-    nice python benchmarks/database.py retrieval --rows 100000 --index exact pq hnsw ivfpq
+    nice python benchmarks/database.py retrieval --rows 100000 --index exact pq
     nice python benchmarks/database.py retrieval --rows 1000000 --index exact pq
     nice python benchmarks/database.py saving --keyframes 10000
     nice python benchmarks/database.py footprint
@@ -195,8 +195,7 @@ def footprint(args: argparse.Namespace) -> None:
     describer = load_describer()
     descriptor = describer.describe(np.random.default_rng(0).integers(0, 255, (480, 640, 3), np.uint8))
     for precision in ("float32", "float16", "int8"):
-        config = describer.config.replace(patch_precision=precision)
-        size = KeyframeDatabase.from_config(config, describer.model.global_dim).bytes_per_keyframe(descriptor)
+        size = KeyframeDatabase(describer.model.global_dim, patch_precision=precision).bytes_per_keyframe(descriptor)
         an_hour = size * 3600 / Config().min_interval_s / 1e6
         print(f"{precision}: {size / 1e3:.1f} KB a keyframe, at most {an_hour:.0f} MB per hour of driving")
 

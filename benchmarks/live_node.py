@@ -82,7 +82,7 @@ def publish(folder: Path | None, rate: float, seconds: float) -> None:
 def fill_map(path: Path, keyframes: int, images: list[NDArray[np.uint8]]) -> None:
     """A saved map of so many keyframes: the pictures' descriptors, their global vectors slightly turned."""
     describer = load_describer()
-    database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
+    database = KeyframeDatabase.for_describer(describer)
     known = [replace(describer.describe(rgb), thumbnail=thumbnail(rgb)) for rgb in images]
     rng = np.random.default_rng(1)
     for number in range(keyframes):

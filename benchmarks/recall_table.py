@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer, describer_from, resized
-from pnv_core.describe.model_files import make_trunk
 from pnv_core.describe.netvlad import NetVLAD, gem
+from pnv_core.describe.trunks import TRUNKS
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.types import PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
@@ -144,7 +144,7 @@ def baselines(args: argparse.Namespace) -> list[tuple[Trunk, dict[str, Head]]]:
         trunk = imagenet_trunk(args.imagenet, fires=8, relu=True)
         found.append((trunk, {"untrained, GeM": gem, "untrained, NetVLAD k-means": fitted(trunk, sample)}))
     if "rootsift" in args.methods.split(","):
-        sift = make_trunk("rootsift", {})
+        sift = TRUNKS.make("rootsift")
         found.append((sift, {"dense RootSIFT VLAD": fitted(sift, sample)}))
     return found
 

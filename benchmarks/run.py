@@ -165,17 +165,15 @@ def plain_reranking(query: PlaceDescriptor, references: list[PlaceDescriptor], s
 def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: int) -> dict[str, Any]:
     query, *references = places(np.random.default_rng(1), candidates + 1, dim)
     sides: dict[str, Callable[[], Any]] = {"baseline": lambda: plain_reranking(query, references, scorer)}
-    for mode in ("exact", "bounded", "coarse") if scorer == "ransac" else ("exact", "coarse"):
-        settings = Config.make(
-            patch_sizes=SIZES,
-            patch_strides=(1, 1, 1),
-            patch_weights=WEIGHTS,
-            scorer=scorer,
-            scale_weight=0.0,
-            match_mode=mode,
-            threads=threads,
-        )
-        sides[mode] = partial(Reranker(settings).scores, query, references)
+    settings = Config.make(
+        patch_sizes=SIZES,
+        patch_strides=(1, 1, 1),
+        patch_weights=WEIGHTS,
+        scorer=scorer,
+        scale_weight=0.0,
+        threads=threads,
+    )
+    sides["product"] = partial(Reranker(settings).scores, query, references)
     return compared(f"re-ranking {candidates} candidates, sizes 2, 5, 8, {scorer}, D={dim}", sides, rounds)
 
 

@@ -111,14 +111,14 @@ def _as_settings(chosen: Measured, candidates: int) -> dict[str, Any]:
 def _sizes(config: Config) -> list[tuple[int, int]]:
     """The size the user named, or the model's and smaller ones that still hold its patches."""
     from pnv_core.describe.describer import describer_from
-    from pnv_core.describe.trunks.trunk import CELL
 
-    done = describer_from(config).config
+    describer = describer_from(config)
+    done, cell = describer.config, describer.cell
     own = (done.image_width, done.image_height)
     if config.image_width and config.image_height:
         return [own]
-    sizes = [(int(own[0] * s) // CELL * CELL, int(own[1] * s) // CELL * CELL) for s in _SHARES]
-    return [s for s in sizes if min(s) >= CELL * (max(done.patch_sizes) + 1)] or [own]
+    sizes = [(int(own[0] * s) // cell * cell, int(own[1] * s) // cell * cell) for s in _SHARES]
+    return [s for s in sizes if min(s) >= cell * (max(done.patch_sizes) + 1)] or [own]
 
 
 def _images(folder: str | None) -> list[NDArray[np.uint8]]:

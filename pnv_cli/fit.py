@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from pnv_cli.common import writable
 from pnv_core.describe.download import resolve_weights
-from pnv_core.describe.model_files import Model, ModelInfo, load_model, make_trunk, save_model
+from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
+from pnv_core.describe.trunks import TRUNKS
 from pnv_core.errors import ConfigError
 from pnv_lab.fit import FitOptions, adapt_model, fit_model, image_files
 
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     base = None if args.trunk else load_model(resolve_weights(args.weights))
     anew = bool(base is None or args.anew or args.clusters or args.global_dim or args.patch_dim or args.no_whiten)
     if anew:
-        trunk = (make_trunk(args.trunk, {}) if base is None else base.trunk).to(args.device)
+        trunk = (TRUNKS.make(args.trunk) if base is None else base.trunk).to(args.device)
         info = ModelInfo(args.trunk) if base is None else base.info
         model = fit_model(trunk, info, files, _options(args, base), _bar)
     else:

@@ -66,7 +66,7 @@ class Config:
         0, "height the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192
     )
     patch_sizes: tuple[int, ...] = setting(
-        (), "patch sizes; empty = the model's", kind=int, unit="cells of 16 px", low=1, high=64
+        (), "patch sizes; empty = the model's", kind=int, unit="cells of the feature map", low=1, high=64
     )
     patch_strides: tuple[int, ...] = setting(
         (), "stride per patch size; empty = 1", kind=int, unit="cells", low=1, high=16
@@ -92,7 +92,7 @@ class Config:
     time_budget_ms: float = setting(
         0.0, "re-rank fewer candidates rather than exceed this; 0 = no budget", unit="ms", low=0.0, high=1e6, live=True
     )
-    index: str = setting("auto", "index of the global vectors", choices=("auto", "exact", "pq", "hnsw", "ivfpq"))
+    index: str = setting("auto", "index of the global vectors: auto, exact, pq, or a registered name")
 
     # Re-ranking
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
@@ -102,13 +102,9 @@ class Config:
         low=0.0,
         high=1.0,
     )
-    match_mode: str = setting(
-        "exact",
-        "exact: score every candidate; bounded: none that provably cannot be best; coarse: none that hardly can",
-        choices=("exact", "bounded", "coarse"),
+    verifier: str = setting(
+        "rootsift", "what examines the best candidates beside their patches: rootsift, or a registered name"
     )
-    match_keep: float = setting(0.25, "share of the candidates that coarse matching scores in full", low=0.0, high=1.0)
-
     verify: int = setting(
         3,
         "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept",

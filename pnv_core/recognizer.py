@@ -14,7 +14,6 @@ from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, ImageRef, LoopClosure, Query
-from pnv_core.verify.local_features import thumbnail
 
 
 class PlaceRecognizer:
@@ -32,7 +31,7 @@ class PlaceRecognizer:
         self.config = describer.config  # the one Config; only its live settings change, by `change`
         self.describer = describer
         if database is None:  # an empty one is false
-            database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim)
+            database = KeyframeDatabase.for_describer(describer)
         self.database = database
         self.timer = timer or StageTimer()
         self.budget = TimeBudget(self.timer.clock)
@@ -58,8 +57,8 @@ class PlaceRecognizer:
         predecessor = self.keyframes.similarity(frame, descriptor)
         self.keyframes.take(frame, descriptor)
         if self.config.verify:
-            descriptor = replace(descriptor, thumbnail=thumbnail(frame.rgb))
-            self.judge.verifier.mask(frame.camera, frame.valid)
+            kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
+            descriptor = replace(descriptor, thumbnail=kept)
         with self.timer.stage("retrieve"):
             recent_ns = int(self.config.exclude_recent_s * 1e9)
             candidates = self.database.nearest(

@@ -25,8 +25,8 @@ class Frame:
 class PatchGrid:
     """The patch descriptors of one patch size: (rows * cols, D) unit rows, row-major over the grid.
 
-    `size` and `stride` count feature cells. Patch (row, col) is centred at pixel
-    (cell * stride * col + cell * size / 2 - 1, the same for row) of the resized image; cell = 16 pixels.
+    `size` and `stride` count feature cells of `cell` pixels. Patch (row, col) is centred at pixel
+    (cell * stride * col + cell * size / 2 - 1, the same for row) of the resized image.
     """
 
     size: int
@@ -34,10 +34,11 @@ class PatchGrid:
     cols: int
     descriptors: NDArray[np.float32]
     stride: int = 1
+    cell: int = 16
 
-    def keypoints(self, cell: int = 16) -> NDArray[np.int64]:
+    def keypoints(self) -> NDArray[np.int64]:
         """(rows * cols, 2) pixel centres (x, y) in the resized image, truncated to whole pixels. Read-only."""
-        return _keypoints(self.size, self.rows, self.cols, self.stride, cell)
+        return _keypoints(self.size, self.rows, self.cols, self.stride, self.cell)
 
     def indices(self) -> NDArray[np.int64]:
         """(rows * cols, 2) grid coordinates (col, row). Read-only."""

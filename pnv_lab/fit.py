@@ -17,7 +17,7 @@ from pnv_core.describe.describer import resized
 from pnv_core.describe.model_files import Model, ModelInfo
 from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule, gem
 from pnv_core.describe.patches import patch_vlads
-from pnv_core.describe.trunks.trunk import CELL, Trunk
+from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".ppm", ".tif", ".tiff")
@@ -245,10 +245,10 @@ def fit_model(
 ) -> Model:
     """A whole model around a ready trunk. `global_dim` falls to what the number of images can fill."""
     trunk.eval()
-    if min(options.image_width, options.image_height) < CELL * max(options.patch_sizes):
+    if min(options.image_width, options.image_height) < trunk.stride * max(options.patch_sizes):
         raise ModelError(
             f"patch sizes {options.patch_sizes} exceed an image of {options.image_width}x{options.image_height}; "
-            f"allowed: 1 to {min(options.image_width, options.image_height) // CELL}"
+            f"allowed: 1 to {min(options.image_width, options.image_height) // trunk.stride}"
         )
     netvlad = fit_vocabulary(trunk, files, options, progress)
     maps = (features_of(trunk, file, options) for file in progress(files, "projections"))

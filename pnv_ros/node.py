@@ -171,9 +171,7 @@ class PlaceRecognizerNode(LifecycleNode):
         config, start = self.settings.node, time.monotonic()
         views = self._views()
         describer = describer_from(self.settings.recogniser)
-        database = KeyframeDatabase.from_config(
-            describer.config, describer.model.global_dim, read_only=config.read_only
-        )
+        database = KeyframeDatabase.for_describer(describer, read_only=config.read_only)
         recognizer = PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
         per_keyframe = database.bytes_per_keyframe(_warm_up(describer))
         if per_keyframe > database.bytes_budget:

@@ -23,7 +23,7 @@ REASONS = {
     Reason.LOW_TEXTURE: "the image shows next to nothing (min_texture)",
     Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency)",
     Reason.ODOMETRY: "the jump is impossible by odometry",
-    Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms or by match_mode (bounded, coarse)",
+    Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms",
     Reason.NOT_VERIFIED: "not among the best that local features examined (verify)",
 }
 DROPS = {

@@ -3,10 +3,9 @@
 Exact search reads 4 * D bytes a row, the quantised scan D / 4. Measured on 2 cores of an AMD EPYC with AVX-512, one
 thread, D = 512, processor time (benchmarks/database.py): 100,000 rows 14 ms exact, 2.4 ms quantised; 1,000,000 rows
 159 ms exact, 12 ms quantised; recall@10 of the quantised scan at least 0.998 on random and on trajectory-like vectors.
-HNSW and IVF-PQ are slower than the scan at equal recall, and slower to build.
+HNSW and IVF-PQ were slower than the scan at equal recall and slower to build; they went.
 """
 
-from collections.abc import Callable
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -14,12 +13,13 @@ from numpy.typing import NDArray
 
 from pnv_core.database.vectors import Allowed, VectorTable
 from pnv_core.errors import ConfigError
+from pnv_core.registry import Registry
 
 EXACT_BYTES = 64_000_000  # above this much to read per query, `auto` scans codes: 5 ms here
 _CATCH_UP = 32  # rows encoded per add while `auto` prepares to leave exact search: 0.3 ms
 
 
-class VectorIndex(Protocol):
+class Index(Protocol):
     """Finds rows by similarity. `search` may give more rows than asked for, in any order; the caller ranks them."""
 
     def nbytes(self, more: int = 0) -> int:
@@ -57,7 +57,7 @@ class ExactIndex:
         return _largest(np.where(allowed.all(), similarity, -np.inf), k)
 
 
-class PqScanIndex:
+class PqIndex:
     """Every similarity, approximately, from 2 bits per dimension; the exact ones of the best 1000 decide.
 
     Product quantisation with 4-bit codes of pairs (FAISS fast scan). Vectors are turned by random signs and a Fourier
@@ -136,79 +136,6 @@ class PqScanIndex:
         return _best(self._table, np.flatnonzero(allowed.all()), query, k)
 
 
-class FaissIndex:
-    """A FAISS index that can only be appended to: removed rows are left out of searches, and the index is built anew
-    when they are more than half of it."""
-
-    def __init__(self, table: VectorTable, build: Callable[[int, NDArray[np.float32]], Any], row_bytes: int) -> None:
-        self._table = table
-        self._build = build
-        self._row_bytes = row_bytes
-        self._built: Any = None
-        self._slots = np.zeros(1024, np.int64)  # (rows of the FAISS index or more,) table row of each
-        self._alive = np.zeros(1024, np.bool_)  # (as many,) False once removed
-        self._place: dict[int, int] = {}  # table row -> row of the FAISS index
-        self._trained_on = 0
-
-    @property
-    def _rows(self) -> int:
-        return self._built.ntotal if self._built is not None else 0
-
-    def nbytes(self, more: int = 0) -> int:
-        return 2 * self._row_bytes * (max(self._rows, len(self._place)) + more)  # FAISS grows its arrays by doubling
-
-    def add(self, slot: int) -> None:
-        self._place[slot] = -1
-        if self._built is not None and self._rows < 2 * max(1024, len(self._place)) and not self._outgrown():
-            self._append(np.array([slot]))
-        elif len(self._place) >= 1024:
-            self._rebuild()
-        else:
-            self._built = None  # so few are searched exactly
-
-    def _outgrown(self) -> bool:
-        return not hasattr(self._built, "hnsw") and len(self._place) > 4 * self._trained_on  # lists, by the first rows
-
-    def _rebuild(self) -> None:
-        slots = np.sort(np.fromiter(self._place, np.int64))
-        self._built = self._build(len(slots), self._table.vectors[slots])
-        self._trained_on = len(slots)
-        self._alive[:] = False
-        self._append(slots)
-
-    def _append(self, slots: NDArray[np.int64]) -> None:
-        first = self._rows
-        self._built.add(self._table.vectors[slots])
-        if self._rows > len(self._slots):
-            self._slots = np.concatenate([self._slots, np.zeros(self._rows, np.int64)])
-            self._alive = np.concatenate([self._alive, np.zeros(self._rows, np.bool_)])
-        self._slots[first : self._rows], self._alive[first : self._rows] = slots, True
-        self._place.update(zip(slots.tolist(), range(first, self._rows), strict=True))
-
-    def remove(self, slot: int) -> None:
-        place = self._place.pop(slot)
-        if place >= 0:
-            self._alive[place] = False
-
-    def search(self, query: NDArray[np.float32], k: int, allowed: Allowed) -> NDArray[np.int64]:
-        faiss = _faiss()
-        rows = np.flatnonzero(allowed.all())
-        if self._built is None or len(rows) <= max(1000, 20 * k):
-            return _best(self._table, rows, query, k)
-        mask = self._alive[: self._rows] & allowed.of(self._slots[: self._rows])
-        bits = np.packbits(mask, bitorder="little")
-        selector = faiss.IDSelectorBitmap(bits)
-        if hasattr(self._built, "hnsw"):
-            parameters = faiss.SearchParametersHNSW(efSearch=max(1000, 20 * k), sel=selector)
-        else:
-            parameters = faiss.SearchParametersIVF(nprobe=max(16, 9 * self._built.nlist // 10), sel=selector)
-        found = self._built.search(query[None], max(1000, 20 * k), params=parameters)[1][0]
-        found = found[found >= 0]
-        if len(found) < k:
-            return _best(self._table, rows, query, k)
-        return _best(self._table, np.sort(self._slots[found]), query, k)
-
-
 class AutoIndex:
     """Exact search while a query reads at most EXACT_BYTES, the quantised scan beyond.
 
@@ -218,7 +145,7 @@ class AutoIndex:
     def __init__(self, table: VectorTable) -> None:
         self._table = table
         self._exact = ExactIndex(table)
-        self._scan: PqScanIndex | None = None
+        self._scan: PqIndex | None = None
 
     def _exact_rows(self) -> int:
         return EXACT_BYTES // (4 * self._table.dim)
@@ -228,7 +155,7 @@ class AutoIndex:
 
     def add(self, slot: int) -> None:
         if self._scan is None and 2 * self._table.high > self._exact_rows() and self._table.dim % 2 == 0:
-            self._scan = PqScanIndex(self._table)
+            self._scan = PqIndex(self._table)
         if self._scan is None:
             return
         if slot < self._scan.rows:
@@ -244,35 +171,11 @@ class AutoIndex:
         return self._scan.search(query, k, allowed)
 
 
-def make_index(name: str, table: VectorTable) -> VectorIndex:
-    """The index of this name over the table. Raises ConfigError."""
-    makers: dict[str, Callable[[VectorTable], VectorIndex]] = {
-        "auto": AutoIndex,
-        "exact": ExactIndex,
-        "pq": PqScanIndex,
-        "hnsw": lambda table: FaissIndex(table, _build_hnsw, 2 * table.dim + 280),
-        "ivfpq": lambda table: FaissIndex(table, _build_ivfpq, table.dim // 4 + 8),
-    }
-    if name not in makers:
-        raise ConfigError(f"index = {name!r} is out of range; allowed: one of {', '.join(makers)}")
-    return makers[name](table)
-
-
-def _build_hnsw(rows: int, vectors: NDArray[np.float32]) -> Any:
-    faiss = _faiss()
-    index = faiss.IndexHNSWSQ(vectors.shape[1], faiss.ScalarQuantizer.QT_fp16, 32, faiss.METRIC_INNER_PRODUCT)
-    index.hnsw.efConstruction = 80
-    index.train(vectors[:1])
-    return index
-
-
-def _build_ivfpq(rows: int, vectors: NDArray[np.float32]) -> Any:
-    faiss = _faiss()
-    dim = vectors.shape[1]
-    lists = max(16, int(np.sqrt(rows)))
-    index = faiss.index_factory(dim, f"IVF{lists},PQ{dim // 2}x4fs", faiss.METRIC_INNER_PRODUCT)
-    index.train(vectors[:: max(1, rows // (64 * lists))])
-    return index
+INDICES: Registry[Index] = Registry(
+    "index",
+    {name: f"pnv_core.database.index:{name.capitalize()}Index" for name in ("auto", "exact", "pq")},
+    ConfigError,
+)
 
 
 def _similarities(rows: NDArray[np.float32], query: NDArray[np.float32]) -> NDArray[np.float32]:

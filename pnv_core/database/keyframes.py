@@ -5,14 +5,13 @@ import threading
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core.config import Config
 from pnv_core.database.eviction import make_eviction
-from pnv_core.database.index import make_index
+from pnv_core.database.index import INDICES
 from pnv_core.database.patch_codes import (
     DTYPES,
     GridLayout,
@@ -26,6 +25,9 @@ from pnv_core.database.patch_file import DiskBuffer, PatchFile
 from pnv_core.database.vectors import Allowed, Row, VectorTable
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.types import ImageRef, PlaceDescriptor
+
+if TYPE_CHECKING:
+    from pnv_core.describe.describer import Describer
 
 MB = 1_000_000
 # Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
@@ -54,9 +56,10 @@ class StoredKeyframe:
     def patches(self) -> tuple[PatchCodes, ...]:
         return views(self.read(), self.layouts)
 
-    def descriptor(self) -> PlaceDescriptor:
+    def descriptor(self, cell: int) -> PlaceDescriptor:
+        """`cell` is the trunk's stride, the same for every keyframe of a model."""
         buffer = self.read()
-        patches = tuple(codes.grid() for codes in views(buffer, self.layouts))
+        patches = tuple(codes.grid(cell) for codes in views(buffer, self.layouts))
         thumbnail = buffer[buffer_bytes(self.layouts) :].tobytes()
         return PlaceDescriptor(self.vector.copy(), patches, self.texture, thumbnail)
 
@@ -120,6 +123,7 @@ class KeyframeDatabase:
         read_only: bool = False,
         patch_folder: str = "",
         disk_budget_gb: float = 32.0,
+        cell: int = 16,
     ) -> None:
         if patch_precision not in DTYPES:
             allowed = ", ".join(DTYPES)
@@ -127,6 +131,7 @@ class KeyframeDatabase:
         if patch_store not in ("memory", "disk"):
             raise ConfigError(f"patch_store = {patch_store!r} is out of range; allowed: one of memory, disk")
         self.dim = dim
+        self.cell = cell
         self.bytes_budget = int(memory_budget_mb * MB)
         self.patch_precision = patch_precision
         self.read_only = read_only
@@ -146,7 +151,7 @@ class KeyframeDatabase:
         self._eviction = make_eviction(self._eviction_name)
         most = self.bytes_budget // (self.dim * 4 + OBJECT_BYTES) + 1
         self._table = VectorTable(2 * most, self.dim)  # twice: a snapshot may hold on to every row it saw
-        self._index = make_index(self._index_name, self._table)
+        self._index = INDICES.make(self._index_name, self._table)
         self._in_memory: dict[int, None] = {}  # ids whose patches are in memory, oldest first
         self._keyframes: dict[int, StoredKeyframe] = {}
         self._ids: list[int] = []  # ascending
@@ -154,9 +159,12 @@ class KeyframeDatabase:
         self._patch_bytes = 0
 
     @classmethod
-    def from_config(cls, config: Config, dim: int, *, read_only: bool = False) -> "KeyframeDatabase":
+    def for_describer(cls, describer: "Describer", *, read_only: bool = False) -> "KeyframeDatabase":
+        """An empty database for what this describer gives, with the memory settings of its Config."""
+        config = describer.config
         return cls(
-            dim,
+            describer.model.global_dim,
+            cell=describer.cell,
             memory_budget_mb=config.memory_budget_mb,
             eviction=config.eviction,
             index=config.index,
@@ -328,7 +336,7 @@ class KeyframeDatabase:
 
     def descriptor(self, keyframe: int) -> PlaceDescriptor:
         """What is stored of a keyframe; its patches are float16 when stored as float16, float32 otherwise."""
-        return self._keyframes[keyframe].descriptor()
+        return self._keyframes[keyframe].descriptor(self.cell)
 
     def patches(self, keyframe: int) -> tuple[PatchCodes, ...]:
         """The patches of a keyframe exactly as stored, one PatchCodes per patch size (int8 with its scales)."""

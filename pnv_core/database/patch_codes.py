@@ -52,10 +52,10 @@ class PatchCodes:
             return self.codes.astype(np.float32, copy=False)
         return self.codes.astype(np.float32) * self.scales[:, None]
 
-    def grid(self) -> PatchGrid:
-        """As a PatchGrid: float32 and float16 codes as they are (no copy), int8 decoded to float32."""
+    def grid(self, cell: int) -> PatchGrid:
+        """As a PatchGrid of cells of `cell` px: float32 and float16 codes as they are (no copy), int8 as float32."""
         descriptors = self.codes if self.scales is None else self.decode()
-        return PatchGrid(self.size, self.rows, self.cols, descriptors, self.stride)
+        return PatchGrid(self.size, self.rows, self.cols, descriptors, self.stride, cell)
 
 
 def layout_of(grids: tuple[PatchGrid, ...], precision: str) -> tuple[GridLayout, ...]:

@@ -8,8 +8,8 @@ import numpy as np
 from pnv_core.config import Config
 from pnv_core.decide.calibration import Calibration, calibration_for
 from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
-from pnv_core.verify.local_features import Verifier, hull_area
 from pnv_core.verify.reranker import Reranker, SpatialResult
+from pnv_core.verify.verifier import VERIFIERS, hull_area
 
 _NEIGHBOURS = 10  # keyframes this close in number show one place
 
@@ -21,7 +21,7 @@ class Judge:
 
     def __init__(self, config: Config, stored_calibration: dict | None) -> None:
         self.reranker = Reranker(config)
-        self.verifier = Verifier()
+        self.verifier = VERIFIERS.make(config.verifier)
         self.calibration: Calibration = calibration_for(stored_calibration, config)
 
     def judged(
@@ -35,16 +35,15 @@ class Judge:
     ) -> list[LoopClosure]:
         """A LoopClosure per candidate, best first, none accepted yet.
 
-        Those beyond the first `limit`, and those the re-ranker leaves out, are refused as not re-ranked.
-
+        Those beyond the first `limit` are refused as not re-ranked.
         `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
         `config.verify` best are examined by local features where both images have a thumbnail. An image with less
         texture than `config.min_texture` scores 0.
         """
         examined = candidates[:limit]
         results = self.reranker.scores(descriptor, [reference for _, _, reference in examined])
-        scored = {i: result for i, result in enumerate(results) if result is not None}
-        left_out = [i for i in range(len(candidates)) if i not in scored]
+        scored = dict(enumerate(results))
+        left_out = range(len(examined), len(candidates))
         found = []
         for number, result in scored.items():
             ref, similarity, reference = candidates[number]
@@ -65,7 +64,7 @@ class Judge:
         if descriptor.thumbnail and config.verify:
             pictures = [(candidates[i][2].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
             shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
-            self.verifier.look_at(shown, self.reranker.workers)
+            self.verifier.prepare(shown, self.reranker.workers)
         for place, (closure, evidence, number) in enumerate(found[: config.verify]):
             picture = candidates[number][2].thumbnail
             if descriptor.thumbnail and picture:

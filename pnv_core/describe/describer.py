@@ -17,11 +17,12 @@ from pnv_core.describe.checkpoints import load_checkpoint
 from pnv_core.describe.download import resolve_weights
 from pnv_core.describe.model_files import Model, load_model
 from pnv_core.describe.patches import PatchAggregator, patch_descriptors
-from pnv_core.describe.trunks.trunk import CELL, Trunk
+from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ConfigError, ImageError
 from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
+_TEXTURE_PX = 16  # side of the squares that count as textured or not
 _FLAT_CELL_STD = 2.0  # grey levels; sensor noise of a blank wall stays below, measured on 8-bit images
 
 
@@ -79,6 +80,11 @@ class Describer:
         return PatchAggregator(self.model.netvlad.centroids, projection.weight, projection.bias, pool, fast)
 
     @property
+    def cell(self) -> int:
+        """Pixels per feature cell: the trunk's stride."""
+        return self.model.trunk.stride
+
+    @property
     def image_size(self) -> tuple[int, int]:
         """(width, height) in pixels that every image is resized to."""
         return self.config.image_width, self.config.image_height
@@ -90,7 +96,7 @@ class Describer:
 
     def grids(self) -> list[tuple[int, int, int, int]]:
         """(size, stride, rows, cols) per patch size."""
-        h, w = self.config.image_height // CELL, self.config.image_width // CELL
+        h, w = self.config.image_height // self.cell, self.config.image_width // self.cell
         pairs = zip(self.config.patch_sizes, self.config.patch_strides, strict=True)
         return [(p, s, (h - p) // s + 1, (w - p) // s + 1) for p, s in pairs]
 
@@ -111,7 +117,7 @@ class Describer:
             vector = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide, cells)[0]
             arrays = self._patches(x[0], weights[0], (features.shape[-2], features.shape[-1]))
             patches = tuple(
-                PatchGrid(size, rows, cols, array, stride)
+                PatchGrid(size, rows, cols, array, stride, self.cell)
                 for array, (size, stride, rows, cols) in zip(arrays, self.grids(), strict=True)
             )
             return PlaceDescriptor(vector.cpu().numpy(), patches, texture(pixels, valid))
@@ -158,9 +164,9 @@ def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8
 
 
 def texture(pixels: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> float:
-    """Share of the 16 px cells whose grey values vary by more than sensor noise, in [0, 1]; of the valid cells only."""
+    """Share of the 16 px squares whose grey values vary by more than sensor noise, in [0, 1]; of valid ones only."""
     grey = cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    h, w = max(grey.shape[0] // CELL, 1), max(grey.shape[1] // CELL, 1)
+    h, w = max(grey.shape[0] // _TEXTURE_PX, 1), max(grey.shape[1] // _TEXTURE_PX, 1)
     mean = cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA)
     square = cv2.resize(grey * grey, (w, h), interpolation=cv2.INTER_AREA)
     textured = square - mean * mean > _FLAT_CELL_STD**2
@@ -191,10 +197,11 @@ def _completed(config: Config, model: Model) -> Config:
         patch_strides=config.patch_strides or (1,) * len(sizes),
         patch_weights=weights,
     )
-    cells = min(width, height) // CELL
+    cell = model.trunk.stride
+    cells = min(width, height) // cell
     if max(sizes) > cells:
         raise ConfigError(
-            f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // CELL}x{height // CELL} cells; "
+            f"patch_sizes = {sizes} exceed the {width}x{height} image of {width // cell}x{height // cell} cells; "
             f"allowed: 1 to {cells}"
         )
     return done

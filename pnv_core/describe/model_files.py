@@ -7,7 +7,6 @@ import hashlib
 import json
 import math
 from dataclasses import asdict, dataclass, field, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,24 +16,19 @@ from safetensors.torch import save as safetensors_bytes
 from torch import Tensor
 
 from pnv_core.describe.netvlad import NetVLAD, Projection, gem
+from pnv_core.describe.trunks import TRUNKS
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
 from pnv_core.files import atomic_write
 
 FORMAT = "pnv-model-1"
-TRUNKS = {
-    "vgg16": "pnv_core.describe.trunks.vgg16:VGG16Trunk",
-    "compact": "pnv_core.describe.trunks.compact:CompactTrunk",
-    "rootsift": "pnv_core.describe.trunks.rootsift:RootSIFTTrunk",
-}
-
 
 _OPTIONAL = ("patch_projection", "pooled_projection")
 
 
 @dataclass(frozen=True)
 class ModelInfo:
-    """What a model file says of itself. Sizes in pixels; `patch_sizes` in cells of 16 pixels."""
+    """What a model file says of itself. Sizes in pixels; `patch_sizes` in cells of the trunk."""
 
     trunk: str
     trunk_options: dict[str, Any] = field(default_factory=dict)
@@ -105,15 +99,6 @@ class Model:
         return replace(self, info=replace(self.info, **changes))
 
 
-def make_trunk(name: str, options: dict[str, Any]) -> Trunk:
-    """A trunk by its name in a model file, weights not yet loaded."""
-    if name not in TRUNKS:
-        raise ModelError(f"trunk {name!r} is not one of {', '.join(TRUNKS)}")
-    module, _, attribute = TRUNKS[name].partition(":")
-    trunk: Trunk = getattr(import_module(module), attribute)(**options)
-    return trunk
-
-
 def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Model:
     """A Model from named tensors; K, C and D come from the shapes. Raises ModelError naming `source` and the fault."""
     groups: dict[str, dict[str, Tensor]] = {}
@@ -125,7 +110,7 @@ def build_model(info: ModelInfo, tensors: dict[str, Tensor], source: str) -> Mod
         raise ModelError(
             f"{source}: holds the parts {sorted(groups)}; allowed: trunk, {', '.join(sorted((*required, *_OPTIONAL)))}"
         )
-    trunk = make_trunk(info.trunk, info.trunk_options)
+    trunk = TRUNKS.make(info.trunk, **info.trunk_options)
     centroids = groups["netvlad"].get("centroids")
     if centroids is None or centroids.ndim != 2 or centroids.shape[1] != trunk.channels:
         shape = None if centroids is None else tuple(centroids.shape)

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.errors import ConfigError
-from pnv_core.verify.local_features import WIDTH, EpipolarCheck
+from pnv_core.verify.local_features import WIDTH
+from pnv_core.verify.verifier import EpipolarCheck
 
 Array = NDArray[np.float64]
 

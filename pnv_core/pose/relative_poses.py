@@ -14,7 +14,7 @@ from pnv_core.pose.geometry import (
 )
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import ImageRef, LoopClosure
-from pnv_core.verify.local_features import EpipolarCheck
+from pnv_core.verify.verifier import EpipolarCheck
 
 _LEAST_BASELINE_M = 0.05  # of shorter ones odometry knows little
 _LONGEST_BASELINE_M = 5.0

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pnv_core.threads import Workers
 from pnv_core.verify.feature_codes import pack, packed, unpack
+from pnv_core.verify.verifier import EpipolarCheck, hull_area
 
 WIDTH = 320  # pixels; at this width a thumbnail takes about a tenth of a keyframe's patches
 _TALLEST = 4 * WIDTH
@@ -32,23 +33,6 @@ class LocalFeatures:
 
     points: NDArray[np.float32]
     descriptors: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class EpipolarCheck:
-    """Matched points (M, 2) of two images in units of their widths, and which (M,) agree on one epipolar geometry.
-
-    `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both.
-    """
-
-    query: NDArray[np.float32]
-    reference: NDArray[np.float32]
-    inlier: NDArray[np.bool_]
-    spread: float
-
-    @property
-    def inliers(self) -> int:
-        return int(self.inlier.sum())
 
 
 def thumbnail(rgb: NDArray[np.uint8]) -> bytes:
@@ -147,28 +131,22 @@ def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float
     return EpipolarCheck(a, b, inlier, min(hull_area(a[inlier]), hull_area(b[inlier])) / aspect)
 
 
-def hull_area(points: NDArray) -> float:
-    """Area of the convex hull of (N, 2) points, in their unit squared; 0 for fewer than three."""
-    if len(points) < 3:
-        return 0.0
-    return float(cv2.contourArea(cv2.convexHull(np.ascontiguousarray(points, np.float32))))
-
-
-class Verifier:
-    """Local features of pictures, the latest kept; neighbouring queries meet the same candidates."""
+class RootSIFTVerifier:
+    """RootSIFT of small pictures, the latest features kept; neighbouring queries meet the same candidates."""
 
     def __init__(self) -> None:
         self._features: OrderedDict[bytes, LocalFeatures] = OrderedDict()
         self._valid: dict[str, NDArray[np.bool_]] = {}
 
-    def mask(self, camera: str, valid: NDArray[np.bool_] | None) -> None:
-        """The robot's own body as `camera` sees it now; it holds for the camera's older pictures as well."""
+    def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
+        """A thumbnail. `valid` leaves out the robot's own body, in the camera's older pictures as well."""
         if valid is not None:
             self._valid[camera] = valid
+        return thumbnail(rgb)
 
-    def look_at(self, pictures: Iterable[tuple[bytes, str]], workers: Workers) -> None:
-        """Find the features of pictures (thumbnail, camera) that are about to be checked, in threads."""
-        new = {picture: camera for picture, camera in pictures if picture not in self._features}
+    def prepare(self, kept: Iterable[tuple[bytes, str]], workers: Workers) -> None:
+        """Find the features of thumbnails that are about to be checked, in threads."""
+        new = {picture: camera for picture, camera in kept if picture not in self._features}
         found = workers.map(lambda item: detect(item[0], self._valid.get(item[1])), new.items())
         self._features.update(zip(new, found, strict=True))
 

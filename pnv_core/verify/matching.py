@@ -57,20 +57,20 @@ def mutual_nearest(query: NDArray[np.floating], reference: NDArray[np.floating])
     return mutual_nearest_rows(patch_rows(query), patch_rows(reference))
 
 
-def mutual_nearest_rows(query: PatchRows, reference: PatchRows, exact: bool = True) -> tuple[Indices, Indices]:
-    """As mutual_nearest, of prepared rows; not `exact` takes the int8 products as they are.
+def mutual_nearest_rows(query: PatchRows, reference: PatchRows) -> tuple[Indices, Indices]:
+    """As mutual_nearest, of prepared rows.
 
-    Otherwise int8 products only say which pairs can be nearest, by a bound: with x = x' + e_x and y = y' + e_y,
-    |x.y - x'.y'| <= |e_x| + |e_y| + |e_x| |e_y| for unit rows. Those pairs are multiplied again in float32.
+    Where int8 products are fast, they only say which pairs can be nearest, by a bound: with x = x' + e_x and
+    y = y' + e_y, |x.y - x'.y'| <= |e_x| + |e_y| + |e_x| |e_y| for unit rows. Those pairs are multiplied in float32.
     """
     if not len(query.rows) or not len(reference.rows):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    forward, backward = _nearest(query, reference, exact)
+    forward, backward = _nearest(query, reference)
     matched = np.flatnonzero((forward >= 0) & (backward[forward] == np.arange(len(forward))))
     return forward[matched], matched
 
 
-def _nearest(query: PatchRows, reference: PatchRows, exact: bool) -> tuple[Indices, Indices]:
+def _nearest(query: PatchRows, reference: PatchRows) -> tuple[Indices, Indices]:
     """The nearest query patch of each reference patch (n_r,) and the reverse (n_q,); -1 for rows of zeros."""
     if query.codes is None or reference.codes is None:
         similarity = reference.rows @ query.rows.T
@@ -79,7 +79,7 @@ def _nearest(query: PatchRows, reference: PatchRows, exact: bool) -> tuple[Indic
     forward, backward = np.empty(len(reference.rows), np.int64), np.empty(len(query.rows), np.int64)
     products = torch._int_mm(torch.from_numpy(reference.codes), torch.from_numpy(query.codes).T).numpy()
     bound = query.error + reference.error + query.error * reference.error
-    margin = np.float32(1.01 * bound + 1e-5) if exact else np.float32(0)  # and the rounding of the bound itself
+    margin = np.float32(1.01 * bound + 1e-5)  # and the rounding of the bound itself
     kernels.nearest_of_products(
         products, query.rows, reference.rows, query.scales, reference.scales, margin, forward, backward
     )

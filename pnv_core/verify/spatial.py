@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core import kernels
-from pnv_core.describe.trunks.trunk import CELL
 from pnv_core.types import PatchGrid, PatchMatches
 
 RANSAC_TOLERANCE_CELLS = 1.5  # the authors' code: 1.5 strides, 24 px (the paper prints one stride)
@@ -31,7 +30,7 @@ def ransac_score(
     q, r = matches
     if len(q) < MIN_MATCHES:
         return 0.0, np.zeros(len(q), bool)
-    tolerance = CELL * query.stride * RANSAC_TOLERANCE_CELLS
+    tolerance = query.cell * query.stride * RANSAC_TOLERANCE_CELLS
     source = reference.keypoints()[r].astype(np.float32)
     target = query.keypoints()[q].astype(np.float32)
     inlier = homography_inliers(source, target, tolerance)

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import resized
-from pnv_core.describe.model_files import Model, ModelInfo, make_trunk, save_model
+from pnv_core.describe.model_files import Model, ModelInfo, save_model
 from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule
+from pnv_core.describe.trunks import TRUNKS
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.images import read_image
 from pnv_lab.evaluation.extraction import Progress
@@ -39,7 +40,7 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
     if target.is_file():
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    trunk = make_trunk("rootsift", {})
+    trunk = TRUNKS.make("rootsift")
 
     def shown(items: Iterable[Path], what: str) -> Iterable[Path]:
         return progress(items, len(files), f"DenseVLAD: {what}")

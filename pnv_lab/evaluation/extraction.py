@@ -71,7 +71,7 @@ def descriptor_record(descriptor: PlaceDescriptor, precision: str) -> Record:
     }
     for grid in descriptor.patches:
         record[f"patches_{grid.size}"] = grid.descriptors.astype(kind)
-        record[f"grid_{grid.size}"] = np.array([grid.rows, grid.cols, grid.stride])
+        record[f"grid_{grid.size}"] = np.array([grid.rows, grid.cols, grid.stride, grid.cell])
     return record
 
 
@@ -84,8 +84,8 @@ def descriptor_of(record: Record, sizes: Sequence[int] | None = None, dim: int |
         sizes = sorted(int(name.removeprefix("grid_")) for name in record if name.startswith("grid_"))
     patches = []
     for size in sizes:
-        rows, cols, stride = (int(v) for v in record[f"grid_{size}"])
-        patches.append(PatchGrid(size, rows, cols, leading(record[f"patches_{size}"], dim), stride))
+        rows, cols, stride, cell = (int(v) for v in record[f"grid_{size}"])
+        patches.append(PatchGrid(size, rows, cols, leading(record[f"patches_{size}"], dim), stride, cell))
     return PlaceDescriptor(leading(record["global"], None), tuple(patches), float(record["texture"][0]))
 
 

@@ -72,7 +72,9 @@ class PooledPatches(_Describing):
             patches = []
             for size, stride, rows, cols in self.describer.grids():
                 pooled = self.pool(features, size, stride)[0].flatten(1).T  # (rows * cols, C)
-                patches.append(PatchGrid(size, rows, cols, F.normalize(pooled, dim=1).cpu().numpy(), stride))
+                patches.append(
+                    PatchGrid(size, rows, cols, F.normalize(pooled, dim=1).cpu().numpy(), stride, self.describer.cell)
+                )
         descriptor = PlaceDescriptor(vector.cpu().numpy(), tuple(patches), texture(pixels))
         return descriptor_record(descriptor, self.precision)
 

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core.describe.trunks.trunk import CELL
 from pnv_core.types import PlaceDescriptor
 from pnv_core.verify.matching import mutual_nearest
 from pnv_core.verify.spatial import MIN_MATCHES, RANSAC_TOLERANCE_CELLS
@@ -31,7 +30,7 @@ def cross_size_score(query: PlaceDescriptor, reference: PlaceDescriptor) -> floa
 
 def _joint(query: PlaceDescriptor, target: NDArray, source: NDArray) -> float:
     patches = sum(g.rows * g.cols for g in query.patches)
-    tolerance = CELL * max(g.stride for g in query.patches) * RANSAC_TOLERANCE_CELLS
+    tolerance = max(g.cell * g.stride for g in query.patches) * RANSAC_TOLERANCE_CELLS
     return homography_inliers(source.astype(np.float32), target.astype(np.float32), tolerance) / patches
 
 

@@ -10,12 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core.describe.trunks.trunk import CELL
-
 Pixels = NDArray[np.uint8]
 Rng = np.random.Generator
 
 _OUTSIDE = 1e4  # where a cell shows nothing of the source, far from every true coordinate
+_CELL = 16  # pixels per feature cell of the trunks that are trained
 _NODE = 8  # pixels per node of the warp grid
 
 
@@ -160,8 +159,8 @@ def _sample(
 
 def _cell_values(nodes: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.float32]:
     """Node values (n, m, 3) at the cell centres, which are every other node: (h, w, 3)."""
-    step = CELL // _NODE
-    return nodes[1::step, 1::step][: size[1] // CELL, : size[0] // CELL].astype(np.float32)
+    step = _CELL // _NODE
+    return nodes[1::step, 1::step][: size[1] // _CELL, : size[0] // _CELL].astype(np.float32)
 
 
 def _curve(image: Pixels, curves: NDArray[np.floating]) -> Pixels:

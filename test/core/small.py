@@ -5,15 +5,16 @@ import torch
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer
-from pnv_core.describe.model_files import Model, ModelInfo, make_trunk
+from pnv_core.describe.model_files import Model, ModelInfo
 from pnv_core.describe.netvlad import NetVLAD, Projection
+from pnv_core.describe.trunks import TRUNKS
 
 WIDTH, HEIGHT = 192, 160
 
 
 def small_model(seed: int = 0, clusters: int = 4, dim: int = 32) -> Model:
     generator = torch.Generator().manual_seed(seed)
-    trunk = make_trunk("rootsift", {})
+    trunk = TRUNKS.make("rootsift")
     netvlad = NetVLAD(clusters, trunk.channels)
     netvlad.centroids.data = torch.rand(clusters, trunk.channels, generator=generator) * 0.1
     netvlad.assignment.data = torch.randn(clusters, trunk.channels, generator=generator) * 5

@@ -9,12 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnv_core import kernels
-from pnv_core.config import Config
 from pnv_core.describe.patches import PatchAggregator, bfloat16_is_fast, patch_descriptors
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.threads import spans, workers
 from pnv_core.timing import StageTimer, TimeBudget
-from pnv_core.types import Frame, PatchGrid, PlaceDescriptor, Reason
+from pnv_core.types import Frame, Reason
 from pnv_core.verify import matching, spatial
 from pnv_core.verify.matching import mutual_nearest, patch_rows
 from pnv_core.verify.reranker import Reranker
@@ -159,58 +158,6 @@ def test_halves_are_unpacked_to_the_bit():
     values = np.arange(2**16, dtype=np.uint16).view(np.float16)
     finite = values[np.isfinite(values)].reshape(-1, 2)
     assert np.array_equal(patch_rows(finite).rows.view(np.uint32), finite.astype(np.float32).view(np.uint32))
-
-
-def places(seed, count, dim=24, sizes=(2, 4)):
-    """The first shows the same place as the query (made with seed and count 1), with noise."""
-    rng = np.random.default_rng(seed)
-    shared = rng.normal(size=(10, 12, dim))
-    found = []
-    for number in range(count):
-        cells = shared if number == 0 else rng.normal(size=shared.shape)
-        noisy = cells + rng.normal(size=cells.shape) * (0.5 if number == 0 else 0)
-        grids = []
-        for size in sizes:
-            rows, cols = 11 - size, 13 - size
-            sums = np.stack([noisy[i : i + size, j : j + size].sum((0, 1)) for i in range(rows) for j in range(cols)])
-            sums /= np.linalg.norm(sums, axis=1, keepdims=True)
-            grids.append(PatchGrid(size, rows, cols, sums.astype(np.float32)))
-        found.append(PlaceDescriptor(np.zeros(dim, np.float32), tuple(grids)))
-    return found
-
-
-def reranker(mode, scorer="ransac", **more):
-    return Reranker(
-        Config.make(
-            patch_sizes=(2, 4), patch_strides=(1, 1), patch_weights=(0.5, 0.5), scorer=scorer, match_mode=mode, **more
-        )
-    )
-
-
-def test_bounded_re_ranking_leaves_out_only_what_cannot_win():
-    query = places(3, 1)[0]
-    references = places(3, 12)[::-1]
-    exact = [r.score for r in reranker("exact").scores(query, references)]
-    bounded = reranker("bounded").scores(query, references)
-    best = int(np.argmax(exact))
-    assert best == 11
-    assert bounded[best].score == exact[best]
-    left_out = [i for i, result in enumerate(bounded) if result is None]
-    assert len(left_out) >= 5
-    assert all(exact[i] <= exact[best] for i in left_out)
-    assert all(result.score == exact[i] for i, result in enumerate(bounded) if result is not None)
-
-
-@pytest.mark.parametrize("scorer", ["ransac", "rapid"])
-def test_coarse_re_ranking_scores_the_kept_share_exactly_and_finds_the_place(scorer):
-    query = places(4, 1)[0]
-    references = places(4, 40)
-    exact = reranker("exact", scorer).scores(query, references)
-    coarse = reranker("coarse", scorer, match_keep=0.25).scores(query, references)
-    scored = [i for i, result in enumerate(coarse) if result is not None]
-    assert len(scored) == 10
-    assert 0 in scored
-    assert all(coarse[i].score == exact[i].score for i in scored)
 
 
 def test_the_plain_path_gives_the_same_descriptor_and_scores(monkeypatch):

@@ -20,7 +20,7 @@ SETTINGS = {"min_interval_s": 0.0, "min_change": 0.0, "accept_score": 0.0, "sure
 
 def _recognizer(read_only: bool) -> PlaceRecognizer:
     describer = small_describer(**SETTINGS)
-    database = KeyframeDatabase.from_config(describer.config, describer.model.global_dim, read_only=read_only)
+    database = KeyframeDatabase.for_describer(describer, read_only=read_only)
     return PlaceRecognizer(describer, database)
 
 

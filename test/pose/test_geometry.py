@@ -11,7 +11,7 @@ from pnv_core.pose.geometry import (
     metric_from_depth,
     relative_direction,
 )
-from pnv_core.verify.local_features import EpipolarCheck
+from pnv_core.verify.verifier import EpipolarCheck
 
 CAMERA = Intrinsics.of_pixels(500.0, 500.0, 320.0, 240.0, 640)
 NOISE = 0.2 / 320  # a fifth of a thumbnail pixel, in image widths

@@ -4,7 +4,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnv_core.describe.trunks.trunk import CELL, ImageNetInput, Trunk
+from pnv_core.describe.trunks.trunk import ImageNetInput, Trunk
 
 FIRES = 6  # of SqueezeNet's eight Fire modules: what the last two add is tuned to ImageNet's classes
 
@@ -64,7 +64,7 @@ class CompactTrunk(Trunk):
 
     def front(self, images: Tensor, layers: int) -> Tensor:
         """(B, 3, H, W) -> what the first `layers` of `features` give."""
-        height, width = (side // CELL * CELL for side in images.shape[2:])
+        height, width = (side // self.stride * self.stride for side in images.shape[2:])
         x = self.input(images[:, :, :height, :width])
         return self.features[:layers](F.pad(x, (0, 1, 0, 1)))
 

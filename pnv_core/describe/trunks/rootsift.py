@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from pnv_core.describe.trunks.trunk import CELL, Trunk
+from pnv_core.describe.trunks.trunk import Trunk
 
 _ORIENTATIONS = 8
 _BINS = 4  # spatial bins per side
@@ -30,7 +30,7 @@ class RootSIFTTrunk(Trunk):
     triangle: Tensor
     blur: Tensor
     angles: Tensor
-    _BIN = CELL // 2  # pixels
+    _BIN = Trunk.stride // 2  # pixels
 
     def __init__(self) -> None:
         super().__init__()
@@ -54,11 +54,11 @@ class RootSIFTTrunk(Trunk):
         return share * torch.hypot(dx, dy)
 
     def forward(self, images: Tensor) -> Tensor:
-        height, width = (side // CELL * CELL for side in images.shape[2:])
+        height, width = (side // self.stride * self.stride for side in images.shape[2:])
         maps = self._orientation_maps(images[:, :, :height, :width])
         batch = maps.shape[0]
         bins = F.conv2d(maps.flatten(0, 1)[:, None], self.triangle, stride=self._BIN, padding=self._BIN // 2)
         bins = bins.view(batch, _ORIENTATIONS, height // self._BIN, width // self._BIN)
         sift = F.unfold(bins, _BINS, stride=2, padding=1)  # (B, 128, h * w)
         sift = F.normalize(F.normalize(sift, dim=1, eps=1e-4).clamp(max=_CLIP), p=1, dim=1, eps=1e-4)
-        return sift.sqrt().view(batch, self.channels, height // CELL, width // CELL)
+        return sift.sqrt().view(batch, self.channels, height // self.stride, width // self.stride)

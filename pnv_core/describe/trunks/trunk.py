@@ -1,18 +1,20 @@
-"""What every feature trunk is: an image to a dense feature map. C channels, h x w = H // 16 x W // 16 cells."""
+"""What every feature trunk is: an image to a dense feature map. C channels, h x w = H // stride x W // stride cells."""
 
 import torch
 from torch import Tensor, nn
-
-CELL = 16  # pixels per feature cell of every trunk (VGG16 conv5)
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 class Trunk(nn.Module):
-    """(B, 3, H, W) RGB in [0, 1] -> (B, C, H // 16, W // 16). Subclasses say their `channels`."""
+    """(B, 3, H, W) RGB in [0, 1] -> (B, C, H // stride, W // stride). Subclasses state their `channels` and `stride`.
+
+    Cell i is centred at pixel stride * i + stride / 2 - 1.
+    """
 
     channels: int
+    stride: int = 16  # pixels per feature cell
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
         """The feature map, and the one before the trunk's neck (B, W, h, w); the same where there is no neck."""

@@ -1,0 +1,59 @@
+"""What examines a candidate beside its patches. A new one is a file here and a line in
+`VERIFIERS`, or `VERIFIERS.register` in a program."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.errors import ConfigError
+from pnv_core.registry import Registry
+from pnv_core.threads import Workers
+
+
+@dataclass(frozen=True, eq=False)
+class EpipolarCheck:
+    """Matched points (M, 2) of two images in units of their widths, and which (M,) agree on one geometry.
+
+    `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both.
+    """
+
+    query: NDArray[np.float32]
+    reference: NDArray[np.float32]
+    inlier: NDArray[np.bool_]
+    spread: float
+
+    @property
+    def inliers(self) -> int:
+        return int(self.inlier.sum())
+
+
+class Verifier(Protocol):
+    """Compares two images by what it kept of each: a picture or features, as bytes that go into the map."""
+
+    def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
+        """(H, W, 3) uint8, optionally (H, W) bool of the pixels to use -> what is kept of the image."""
+        ...
+
+    def prepare(self, kept: Iterable[tuple[bytes, str]], workers: Workers) -> None:
+        """Called before `check` with everything (kept, camera) that is about to be compared."""
+        ...
+
+    def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
+        """Two images by what was kept of them. Damaged bytes agree on nothing."""
+        ...
+
+
+VERIFIERS: Registry[Verifier] = Registry(
+    "verifier", {"rootsift": "pnv_core.verify.local_features:RootSIFTVerifier"}, ConfigError
+)
+
+
+def hull_area(points: NDArray) -> float:
+    """Area of the convex hull of (N, 2) points, in their unit squared; 0 for fewer than three."""
+    if len(points) < 3:
+        return 0.0
+    return float(cv2.contourArea(cv2.convexHull(np.ascontiguousarray(points, np.float32))))
