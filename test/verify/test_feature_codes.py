@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pnv_core.verify.feature_codes import pack, packed, unpack
-from pnv_core.verify.local_features import Verifier, detect, features_of, thumbnail
+from pnv_core.verify.local_features import RootSIFTVerifier, detect, features_of, thumbnail
 from pnv_lab.worlds import loop_sequence
 
 
@@ -20,8 +20,8 @@ def revisit() -> list[bytes]:
 
 def test_packed_features_check_as_their_pictures_do(revisit):
     first, again, elsewhere = revisit
-    pictures = [Verifier().check(first, "", other, "").inliers for other in (again, elsewhere)]
-    codes = [Verifier().check(features_of(first), "", features_of(other), "").inliers for other in (again, elsewhere)]
+    pictures = [RootSIFTVerifier().check(first, "", other, "").inliers for other in (again, elsewhere)]
+    codes = [RootSIFTVerifier().check(features_of(first), "", features_of(other), "").inliers for other in (again, elsewhere)]
     assert codes[0] > 0.75 * pictures[0]
     assert codes[1] < 0.5 * codes[0]
 
@@ -62,4 +62,4 @@ def test_damaged_codes_are_refused_and_show_nothing(revisit, damage):
     with pytest.raises(ValueError, match="packed"):
         unpack(codes)
     assert len(detect(codes).points) == 0
-    assert Verifier().check(codes, "", revisit[0], "").inliers == 0
+    assert RootSIFTVerifier().check(codes, "", revisit[0], "").inliers == 0
