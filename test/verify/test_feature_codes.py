@@ -20,8 +20,9 @@ def revisit() -> list[bytes]:
 
 def test_packed_features_check_as_their_pictures_do(revisit):
     first, again, elsewhere = revisit
-    pictures = [RootSIFTVerifier().check(first, "", other, "").inliers for other in (again, elsewhere)]
-    codes = [RootSIFTVerifier().check(features_of(first), "", features_of(other), "").inliers for other in (again, elsewhere)]
+    verifier = RootSIFTVerifier()
+    pictures = [verifier.check(first, "", other, "").inliers for other in (again, elsewhere)]
+    codes = [verifier.check(features_of(first), "", features_of(other), "").inliers for other in (again, elsewhere)]
     assert codes[0] > 0.75 * pictures[0]
     assert codes[1] < 0.5 * codes[0]
 
