@@ -73,7 +73,9 @@ class StampIds:
     def _settled(self) -> list[NodePair]:
         if not self._nodes:
             return []
-        pairs, waiting, newest = [], deque(), self._nodes[-1][0]
+        pairs: list[NodePair] = []
+        waiting: deque[LoopClosure] = deque()
+        newest = self._nodes[-1][0]
         for closure in self._waiting:
             query, match = self.nearest(closure.query.stamp_ns), self.nearest(closure.match.stamp_ns)
             if query and match and newest >= closure.query.stamp_ns:  # earlier, a nearer node may still come

@@ -1,6 +1,7 @@
 """pnv describe IMAGE -o OUT.npz"""
 
 import argparse
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     config = config_from(args)
     image = read_image(args.image)
     descriptor = describer_from(config).describe(image)
-    arrays = {"global": descriptor.global_vector}
+    arrays: dict[str, Any] = {"global": descriptor.global_vector}
     for grid in descriptor.patches:
         arrays[f"patches_{grid.size}"] = np.asarray(grid.descriptors, np.float32)
         arrays[f"grid_{grid.size}"] = np.array([grid.rows, grid.cols])

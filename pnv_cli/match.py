@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     if picture and picture.suffix.lower() not in PICTURES:
         raise ConfigError(f"--draw {picture}: is no picture; allowed: {', '.join(PICTURES)}")
     describer = describer_from(config_from(args))
-    images = [read_image(path) for path in (args.query, args.reference)]
+    images = read_image(args.query), read_image(args.reference)
     query, reference = (describer.describe(image) for image in images)
     result = Reranker(describer.config).score(query, reference)
     sizes = []

@@ -30,6 +30,9 @@ class Trunk(nn.Module):
 class ImageNetInput(nn.Module):
     """Subtracts the ImageNet mean and divides by the standard deviation, per channel."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self) -> None:
         super().__init__()
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)

@@ -28,4 +28,5 @@ class VGG16Trunk(Trunk):
         self.features = nn.Sequential(*layers[:-1])
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.features(self.input(images))  # type: ignore[no-any-return]
+        features: Tensor = self.features(self.input(images))
+        return features
