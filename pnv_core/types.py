@@ -10,15 +10,26 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from pnv_core.errors import PnvError
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One camera image. `stamp_ns` is the image's own stamp (never the wall clock), `rgb` is (H, W, 3) uint8."""
+    """One camera image. `stamp_ns` is the image's own stamp (never the wall clock), `rgb` is (H, W, 3) uint8.
+
+    Raises PnvError for a stamp that is no whole number of nanoseconds: seconds in a float would all be one moment.
+    """
 
     stamp_ns: int
     camera: str
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_] | None = None  # (H, W), False where the robot sees itself; None = all valid
+
+    def __post_init__(self) -> None:
+        whole = isinstance(self.stamp_ns, int | np.integer) and not isinstance(self.stamp_ns, bool)
+        if not whole or not -(2**63) <= self.stamp_ns < 2**63:
+            raise PnvError(f"stamp_ns = {self.stamp_ns!r}; allowed: a whole number of nanoseconds in 64 bits")
+        object.__setattr__(self, "stamp_ns", int(self.stamp_ns))  # numpy's integers go into no JSON
 
 
 @dataclass(frozen=True, eq=False)
