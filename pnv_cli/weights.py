@@ -1,13 +1,12 @@
-"""pnv weights list | fetch NAME | verify FILE"""
+"""pnv weights list | fetch NAME | verify NAME or FILE"""
 
 import argparse
 import sys
-from pathlib import Path
 
 from tqdm import tqdm
 
 from pnv_core.describe.describer import read_model
-from pnv_core.describe.download import DEFAULT_MODEL, PUBLISHED, fetch, file_sha256, recorded_sha256
+from pnv_core.describe.download import DEFAULT_MODEL, PUBLISHED, fetch, file_sha256, recorded_sha256, resolve_weights
 from pnv_core.errors import ModelError
 
 
@@ -20,7 +19,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     fetching.add_argument("name", metavar="NAME", help=", ".join(PUBLISHED))
     fetching.set_defaults(run=_fetch)
     verifying = actions.add_parser("verify", help="load a model file and check it against its recorded hash")
-    verifying.add_argument("file", metavar="FILE")
+    verifying.add_argument("file", metavar="FILE", help="a model file, or a name that `pnv weights list` prints")
     verifying.set_defaults(run=_verify)
 
 
@@ -47,7 +46,7 @@ def _fetch(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
-    path = Path(args.file)
+    path = resolve_weights(args.file)
     model = read_model(path)
     digest = file_sha256(path)
     for item in PUBLISHED.values():

@@ -277,3 +277,10 @@ def test_weights_list_names_the_six_published_files(capsys):
     for family in ("mapillary", "pittsburgh"):
         for dim in (128, 512, 4096):
             assert f"{family}_WPCA{dim}" in out
+
+
+def test_weights_verify_takes_the_names_that_weights_list_prints(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert main(["weights", "verify", "default"]) == 0
+    assert "default.safetensors: " in capsys.readouterr().out
+    assert "pnv weights fetch mapillary_WPCA128" in refused(capsys, "weights", "verify", "mapillary_WPCA128")
