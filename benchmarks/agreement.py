@@ -12,7 +12,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +19,7 @@ from pnv_core import load_describer
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer
 from pnv_core.files import atomic_write
+from pnv_core.images import read_image
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.verify.matching import mutual_nearest
 from pnv_core.verify.reranker import Reranker
@@ -40,7 +40,7 @@ def describer_of(threads: int, **settings: str) -> Describer:
 
 
 def described(describer: Describer, paths: list[Path]) -> list[PlaceDescriptor]:
-    return [describer.describe(cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB)) for p in paths]
+    return [describer.describe(read_image(p)) for p in paths]
 
 
 def stored(descriptor: PlaceDescriptor, dim: int, precision: str) -> PlaceDescriptor:

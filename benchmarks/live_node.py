@@ -35,6 +35,7 @@ from msg_adapters.loop_closures import closures_from_message
 from pnv_core import load_describer
 from pnv_core.database import KeyframeDatabase
 from pnv_core.files import atomic_write
+from pnv_core.images import read_image
 from pnv_core.maps import MapStore
 from pnv_core.verify.local_features import thumbnail
 from pnv_ros.outputs import CLOSURES_QOS
@@ -50,7 +51,7 @@ def pictures(folder: Path | None) -> list[NDArray[np.uint8]]:
     if folder is not None:
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
         paths = paths[:: max(1, len(paths) // _PICTURES)][:_PICTURES]
-        return [cv2.resize(cv2.cvtColor(cv2.imread(str(p)), cv2.COLOR_BGR2RGB), (WIDTH, HEIGHT)) for p in paths]
+        return [cv2.resize(read_image(p), (WIDTH, HEIGHT)) for p in paths]
     rng = np.random.default_rng(0)
     scales = [rng.integers(0, 256, (HEIGHT // s, 2 * WIDTH // s, 3), np.uint8) for s in (4, 16, 60)]
     wide = np.mean([cv2.resize(s, (2 * WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for s in scales], axis=0)

@@ -4,7 +4,6 @@ Only attributes are read, so live messages, messages from a bag and test doubles
 refused with an ImageError before anything of its claimed size is allocated.
 """
 
-import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -13,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.errors import ImageError
+from pnv_core.images import MAX_PIXELS, decode_image, to_8_bit
 from pnv_core.types import Frame
 
 MIN_SIDE = 16  # one cell of the feature map
 MAX_SIDE = 16384
-MAX_PIXELS = 1 << 26  # 64 megapixels: 192 MiB as RGB
 MAX_JPEG_SCANS = 100  # a progressive file has about 10; each one costs a pass over the whole image
 
 
@@ -35,14 +34,10 @@ def _cvt(code: int) -> Callable[[NDArray[Any]], NDArray[np.uint8]]:
 
 
 def _deep_gray_to_rgb(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    return cv2.cvtColor(_to_8_bit(pixels), cv2.COLOR_GRAY2RGB)
+    return cv2.cvtColor(to_8_bit(pixels), cv2.COLOR_GRAY2RGB)
 
 
-def _to_8_bit(pixels: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Scale by the bits in use: 10, 12 and 14 bit cameras leave the upper bits of 16 empty."""
-    bits = max(8, int(pixels.max()).bit_length())
-    return cv2.convertScaleAbs(pixels, alpha=255.0 / ((1 << bits) - 1))
-
+_MAGIC = {b"\xff\xd8\xff": "jpeg", b"\x89PNG\r\n\x1a\n": "png"}
 
 # OpenCV names a Bayer pattern by its second row and column, ROS by its first: bayer_rggb8 is BayerBG.
 ENCODINGS: dict[str, Encoding] = {
@@ -80,7 +75,7 @@ def message_to_frame(message: Any, camera: str) -> Frame:
 def image_to_rgb(message: Any) -> NDArray[np.uint8]:
     """sensor_msgs/Image -> (H, W, 3) uint8. Row padding and byte order are honoured.
 
-    16-bit grey is scaled by the bits the frame uses, 8 to 16. Raises ImageError for an unknown encoding, a size out
+    16-bit grey is scaled as `pnv_core.images.to_8_bit` says. Raises ImageError for an unknown encoding, a size out
     of limits, a step smaller than a row, and data shorter than step * height.
     """
     encoding = ENCODINGS.get(message.encoding)
@@ -105,40 +100,26 @@ def image_to_rgb(message: Any) -> NDArray[np.uint8]:
 
 
 def compressed_to_rgb(message: Any) -> NDArray[np.uint8]:
-    """sensor_msgs/CompressedImage of jpeg or png (8 or 16 bit) -> (H, W, 3) uint8.
+    """sensor_msgs/CompressedImage of jpeg or png (8 or 16 bit) -> (H, W, 3) uint8, as `decode_image` gives it.
 
     The size is read from the file's header and checked before anything is unpacked; a file that stops early is
     refused rather than filled with grey. Raises ImageError.
     """
     if "compressedDepth" in message.format:
         raise ImageError(f"compressed image format {message.format!r} is a depth image; allowed: jpeg, png")
-    data = _bytes_of(message.data)
-    head = data[:32].tobytes()
-    if head.startswith(b"\xff\xd8\xff"):
-        kind, size = "jpeg", _jpeg_size(data.tobytes())
-    elif head.startswith(b"\x89PNG\r\n\x1a\n"):
-        kind, size = "png", _png_size(data.tobytes())
-    else:
+    data = _bytes_of(message.data).tobytes()
+    kind = next((name for magic, name in _MAGIC.items() if data.startswith(magic)), None)
+    if kind is None:
         raise ImageError(
-            f"compressed image of format {message.format!r} starts with {head[:8].hex(' ') or 'nothing'}; "
+            f"compressed image of format {message.format!r} starts with {data[:8].hex(' ') or 'nothing'}; "
             "allowed: jpeg, png"
         )
-    check_size(*size)
-    try:
-        pixels = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        raise ImageError(f"{kind} image of {data.size} bytes cannot be decoded: {error.err}") from None
-    if pixels is None:
-        raise ImageError(f"{kind} image of {data.size} bytes cannot be decoded")
-    if pixels.dtype == np.uint16:
-        pixels = _to_8_bit(pixels)
-    if pixels.dtype != np.uint8:
-        raise ImageError(f"{kind} image has pixels of {pixels.dtype}; allowed: 8 or 16 bit")
-    channels = 1 if pixels.ndim == 2 else pixels.shape[2]
-    to_rgb = {1: cv2.COLOR_GRAY2RGB, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}
-    if channels not in to_rgb:
-        raise ImageError(f"{kind} image has {channels} channels; allowed: 1, 3 or 4")
-    return cv2.cvtColor(pixels, to_rgb[channels])
+    name = f"{kind} image of {len(data)} bytes"
+    if kind == "jpeg" and (scans := data.count(b"\xff\xda")) > MAX_JPEG_SCANS:
+        raise ImageError(f"{name} has {scans} scans; allowed: at most {MAX_JPEG_SCANS}")
+    rgb = decode_image(data, name, (kind,))
+    check_size(rgb.shape[1], rgb.shape[0])
+    return rgb
 
 
 def _bytes_of(data: Any) -> NDArray[np.uint8]:
@@ -153,31 +134,3 @@ def check_size(width: int, height: int) -> None:
         raise ImageError(
             f"image is {width}x{height} pixels; allowed: sides of {MIN_SIDE} to {MAX_SIDE}, at most {MAX_PIXELS} pixels"
         )
-
-
-def _png_size(data: bytes) -> tuple[int, int]:
-    if len(data) < 33 or data[12:16] != b"IHDR":
-        raise ImageError(f"png image of {len(data)} bytes has no header; allowed: a whole png file")
-    if b"IEND" not in data[-64:]:
-        raise ImageError(f"png image of {len(data)} bytes stops early; allowed: a whole png file")
-    width, height = struct.unpack(">II", data[16:24])
-    return width, height
-
-
-def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Width and height from the frame header (ITU T.81 B.2.2); thumbnails inside other segments are passed over."""
-    if b"\xff\xd9" not in data.rstrip(b"\0")[-64:]:  # drivers pad to whole blocks
-        raise ImageError(f"jpeg image of {len(data)} bytes stops early; allowed: a whole jpeg file")
-    if data.count(b"\xff\xda") > MAX_JPEG_SCANS:
-        raise ImageError(f"jpeg image has {data.count(bytes([255, 218]))} scans; allowed: at most {MAX_JPEG_SCANS}")
-    at = 2
-    while at + 9 <= len(data) and data[at] == 0xFF:
-        marker, (length,) = data[at + 1], struct.unpack(">H", data[at + 2 : at + 4])
-        if marker == 0xFF:  # fill byte
-            at += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        else:
-            at += 2 + length
-    raise ImageError(f"jpeg image of {len(data)} bytes has no frame header; allowed: a whole jpeg file")

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
 from torch import Tensor
 
 from pnv_core.describe.describer import resized
@@ -19,8 +18,8 @@ from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule, gem
 from pnv_core.describe.patches import patch_vlads
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
+from pnv_core.images import SUFFIXES, read_image
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".ppm", ".tif", ".tiff")
 SHRINKAGE = 0.9  # of the whitening that adapts a trained projection; less of it forgets what training learned
 SAMPLES_PER_DIMENSION = 4  # images a whitened principal direction is estimated from; with fewer it is mostly noise
 Progress = Callable[[Iterable[Path], str], Iterable[Path]]
@@ -48,20 +47,16 @@ def image_files(folders: Sequence[Path | str]) -> list[Path]:
     """Every image under the folders, in name order. Raises ModelError for a folder that is missing or has none."""
     found: list[Path] = []
     for folder in map(Path, folders):
-        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES) if folder.is_dir() else []
+        files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
         if not files:
-            raise ModelError(f"{folder}: no folder with images; allowed: files ending in {', '.join(IMAGE_SUFFIXES)}")
+            raise ModelError(f"{folder}: no folder with images; allowed: files ending in {', '.join(SUFFIXES)}")
         found += files
     return found
 
 
 def read_rgb(path: Path, width: int, height: int) -> np.ndarray:
-    """(height, width, 3) uint8, resized as the describer does. Raises ModelError for a file that is no image."""
-    try:
-        with Image.open(path) as image:
-            return resized(np.asarray(image.convert("RGB")), width, height)
-    except (OSError, ValueError) as error:
-        raise ModelError(f"{path}: not a readable image ({error})") from None
+    """(height, width, 3) uint8, read and resized as the describer's images are. Raises ImageError."""
+    return resized(read_image(path), width, height)
 
 
 def as_batch(images: Sequence[np.ndarray] | np.ndarray, device: torch.device | str = "cpu") -> Tensor:

@@ -118,9 +118,11 @@ Names without a leading slash are relative to the node's namespace, `~` is the n
 | `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; places keyframes in `~/markers` |
 
 `transport: auto` takes the message type that is published. Of Image these encodings are understood: {encodings};
-row padding and byte order are honoured, 16 bit grey is scaled by the bits in use. CompressedImage is jpeg or png, 8 or
-16 bit. Sides are 16 to 16384 pixels, 64 megapixels at most; a compressed image is measured by its header before
-anything is unpacked.
+row padding and byte order are honoured. CompressedImage is jpeg or png, 8 or 16 bit. Sides are 16 to 16384 pixels, 67
+megapixels at most; a compressed image is measured by its header before anything is unpacked. 16 bit pixels, of messages
+and of files, are scaled by the smallest of 8, 10, 12, 14 and 16 bits that holds all but a thousandth of the frame's
+pixels: a 12 bit camera's frames keep their brightness whatever hot pixels there are, and one dark enough for fewer bits
+is brightened.
 
 Uncompressed images of more than a few hundred kilobytes need a larger shared memory segment than Fast DDS has by
 default: set `FASTRTPS_DEFAULT_PROFILES_FILE` to `config/fastdds_shared_memory.xml` for camera and node, or send

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from msg_adapters.camera_info import Rectifier
 from msg_adapters.images import MIN_SIDE
 from pnv_core.errors import ConfigError, ImageError
+from pnv_core.images import read_image
 from pnv_core.pose.geometry import Intrinsics
 from pnv_core.types import Frame
 
@@ -55,9 +56,10 @@ def read_mask(path: str) -> NDArray[np.uint8]:
     file = Path(path).expanduser()
     if not file.is_file():
         raise ConfigError(f"mask {path!r} is no file; allowed: an image, black where pixels are ignored")
-    pixels = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
-    if pixels is None:
-        raise ConfigError(f"mask {path!r} cannot be decoded; allowed: an image, black where pixels are ignored")
+    try:
+        pixels = cv2.cvtColor(read_image(file), cv2.COLOR_RGB2GRAY)
+    except ImageError as error:
+        raise ConfigError(f"mask {error}; allowed: an image, black where pixels are ignored") from None
     if not pixels.any():
         raise ConfigError(f"mask {path!r} is black; allowed: an image with something left to look at")
     return np.where(pixels > 0, 255, 0).astype(np.uint8)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.drawing import draw_match
+from pnv_core.images import read_image
 from pnv_core.types import Frame, LoopClosure
 from pnv_lab.evaluation.datasets.tables import number, rows
 from pnv_lab.evaluation.report import (
@@ -118,10 +119,9 @@ class RunRecorder:
         stamps = closure.query.stamp_ns, closure.match.stamp_ns
         images = []
         for stamp in stamps:
-            bgr = cv2.imread(str(self._picture(stamp)))
-            if bgr is None:
+            if not self._picture(stamp).is_file():
                 return ""  # a keyframe of a loaded map: its picture is not part of this run
-            images.append(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(np.uint8))
+            images.append(read_image(self._picture(stamp)))
         drawn = draw_match(images[0], images[1], closure.matches, self.image_size, f"score {closure.score:.3f}")
         words = " ↔ ".join(html.escape(self._names.get(s, str(s))) for s in stamps)
         if closure.reason:

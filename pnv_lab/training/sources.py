@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.errors import ModelError
+from pnv_core.images import read_image
 
 Pose = tuple[float, float, float, float]  # x, y, z in metres, yaw in radians
 
@@ -169,10 +170,8 @@ def _rows(path: Path) -> list[dict[str, str]]:
 
 
 def _read(path: Path, longer_side: int) -> NDArray[np.uint8]:
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ModelError(f"{path}: not a readable image")
+    image = read_image(path)
     scale = longer_side / max(image.shape[:2])
-    if scale < 1:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(image[:, :, ::-1])
+    if scale >= 1:
+        return image
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8, copy=False)
