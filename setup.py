@@ -17,6 +17,7 @@ REQUIRED = [
     "numba>=0.60",  # compiled inner loops; the code runs without it, slower
     "threadpoolctl>=3",
     "tqdm>=4.60",
+    "msgspec>=0.18",  # what files say is checked against types and bounds
     "rosbags>=0.10",  # rosbag2 in sqlite3 and mcap without a ROS installation
 ]
 

@@ -38,7 +38,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     prune.add_argument("map", type=Path)
     _output(prune, "the new map")
     prune.add_argument("--keep", type=int, metavar="N", help="at most so many keyframes")
-    prune.add_argument("--budget-mb", type=float, metavar="MB", help="at most so much of descriptors")
+    prune.add_argument("--budget-mb", type=float, metavar="MB", help="so that it loads with this memory_budget_mb")
     prune.add_argument("--drop-session", type=int, action="append", default=[], metavar="S", help="may be repeated")
     prune.add_argument("--eviction", choices=("oldest", "densest"), default="densest", help="which go first")
 

@@ -62,6 +62,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._map: SavedMap | None = None
         self._others: list[Any] = []
         self._autosave: Autosave | None = None
+        self.unsaved = False  # whether the last save of an autosaving node failed
         self._statistics = Statistics()
         self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
         self._own_services = Services(self, self)
@@ -157,7 +158,9 @@ class PlaceRecognizerNode(LifecycleNode):
         if recognition is None:
             raise PnvError(NOT_CONFIGURED)
         count = recognition.reset()
-        return f"forgot {count} keyframes"
+        saved = self._map.path if self._map is not None and self._map.path and self._map.exists() else ""
+        kept = f"; the map at {saved} is kept beside, as {saved}.before-N, when it is saved next" if saved else ""
+        return f"forgot {count} keyframes{kept}"
 
     def pause(self, on: bool) -> str:
         if self._inputs is None:
@@ -310,6 +313,7 @@ class PlaceRecognizerNode(LifecycleNode):
         if self._autosave is not None:
             self._autosave.stop()
             self._autosave = None
+            self.unsaved = bool(self._statistics.autosave_failure)
 
     def _free(self) -> None:
         if self._recognition is not None:

@@ -43,7 +43,10 @@ class Spinning:
 
 
 def main(args: list[str] | None = None) -> int:
-    """0 after SIGINT or SIGTERM, 2 for unusable settings, 1 with the traceback after a failure."""
+    """0 after SIGINT or SIGTERM, 2 for unusable settings, 1 with the traceback after a failure.
+
+    1 too where autosave is on and the last save failed.
+    """
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))
@@ -66,7 +69,7 @@ def main(args: list[str] | None = None) -> int:
         spinning.end()
         node.stop()
         node.destroy_node()
-        return 1 if isinstance(end, BaseException) else 0
+        return 1 if isinstance(end, BaseException) or node.unsaved else 0
     finally:
         rclpy.try_shutdown()
 

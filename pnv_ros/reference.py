@@ -170,9 +170,11 @@ of the same session: LIO-SAM knows the stamps of its own run only, so nothing is
 | `~/reset` | std_srvs/Trigger | forget every keyframe, and the stamps seen |
 | `~/pause` | std_srvs/SetBool | drop images until set to false; the map is kept |
 
-Images go on being processed while a map is written; `~/load` and `~/reset` wait for the frame in hand. `autosave`
-without `load_on_start` is refused where `map_path` already holds a map, since a map that was not loaded is never
-overwritten. An autosave that fails turns `/diagnostics` to ERROR until one succeeds.
+Images go on being processed while a map is written or read; `~/load` and `~/reset` wait for the frame in hand.
+`autosave` without `load_on_start` is refused where `map_path` already holds a map, since a map that was not loaded is
+never overwritten. A map that this run saved and then left by `~/reset` or `~/load` is kept in a folder beside,
+`<map_path>.before-1` and so on, when another one is saved in its place. An autosave that fails turns `/diagnostics` to
+ERROR until one succeeds; where the last one fails, the node ends with status 1.
 
 ## Life cycle
 

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 from pnv_core.database import KeyframeDatabase, Snapshot
 from pnv_core.errors import MapError
@@ -18,6 +19,7 @@ class SavedMap:
     def __init__(self, database: KeyframeDatabase, fingerprint: str) -> None:
         self._database, self._fingerprint = database, fingerprint
         self._store: MapStore | None = None
+        self._used: dict[Path, MapStore] = {}  # by path: what this run has saved or loaded, it may save over
         self._writing = threading.Lock()
         self._path = ""
 
@@ -28,7 +30,8 @@ class SavedMap:
     @path.setter
     def path(self, path: str) -> None:
         if path != self._path:
-            self._path, self._store = path, MapStore(path, self._fingerprint) if path else None
+            self._path = path
+            self._store = (self._used.get(Path(path)) or MapStore(path, self._fingerprint)) if path else None
 
     def exists(self) -> bool:
         """Whether a map was saved there before."""
@@ -38,17 +41,23 @@ class SavedMap:
         """Save the database, or a snapshot of it. Raises MapError; the map on disk is then as it was."""
         store = self._opened()
         with self._writing:
-            return store.save(snapshot or self._database.snapshot())
+            report = store.save(snapshot or self._database.snapshot())
+            self._used[store.path] = store
+            return report
 
     def load(self, still: AbstractContextManager[object], loaded: Callable[[], None]) -> int:
         """Replace the database's content and begin a new session; the number of keyframes. Raises MapError.
 
-        A save under way is waited for first. `still` is entered after that and held until `loaded` has returned.
+        A save under way is waited for first. Frames go on with the map before until the new one is whole in memory;
+        `still` is entered then and held until `loaded` has returned.
         """
         store = self._opened()
-        with self._writing, still:
-            store.load(self._database)
-            loaded()
+        with self._writing:
+            manifest, prepared = store.read(self._database)
+            with still:
+                store.put(self._database, manifest, prepared)
+                loaded()
+            self._used[store.path] = store
             return len(self._database)
 
     def autosave(self, interval_s: float, report: Callable[[SaveReport | MapError], None]) -> Autosave:

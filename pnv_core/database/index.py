@@ -16,7 +16,7 @@ from pnv_core.errors import ConfigError
 from pnv_core.registry import Registry
 
 EXACT_BYTES = 64_000_000  # above this much to read per query, `auto` scans codes: 5 ms here
-_CATCH_UP = 32  # rows encoded per add while `auto` prepares to leave exact search: 0.3 ms
+CATCH_UP = 32  # rows encoded per add while `auto` prepares to leave exact search: 0.3 ms
 
 
 class Index(Protocol):
@@ -151,7 +151,7 @@ class AutoIndex:
         return EXACT_BYTES // (4 * self._table.dim)
 
     def nbytes(self, more: int = 0) -> int:
-        return self._scan.nbytes(more * (_CATCH_UP + 1)) if self._scan is not None else 0
+        return self._scan.nbytes(more * (CATCH_UP + 1)) if self._scan is not None else 0
 
     def add(self, slot: int) -> None:
         if self._scan is None and 2 * self._table.high > self._exact_rows() and self._table.dim % 2 == 0:
@@ -160,7 +160,7 @@ class AutoIndex:
             return
         if slot < self._scan.rows:
             self._scan.add(slot)
-        self._scan.encode_up_to(min(self._table.high, self._scan.rows + _CATCH_UP))
+        self._scan.encode_up_to(min(self._table.high, self._scan.rows + CATCH_UP))
 
     def remove(self, slot: int) -> None:
         pass

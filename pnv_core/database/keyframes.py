@@ -1,5 +1,6 @@
 """KeyframeDatabase. N = keyframes, D = dimension of the global vector."""
 
+import copy
 import logging
 import threading
 from bisect import bisect_left
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.database.eviction import make_eviction
-from pnv_core.database.index import INDICES
+from pnv_core.database.index import CATCH_UP, EXACT_BYTES, INDICES, PqIndex
 from pnv_core.database.patch_codes import (
     DTYPES,
     GridLayout,
@@ -87,6 +88,14 @@ class DatabaseStats:
     disk_bytes: int = 0
 
 
+def bytes_needed(dim: int, keyframes: int, patch_bytes: int) -> int:
+    """Bytes a database with `index: auto` counts once so many keyframes are in, each row in use."""
+    table = VectorTable(1, dim)
+    used = patch_bytes + keyframes * (table.row_bytes + OBJECT_BYTES)
+    scanned = 8 * dim * keyframes > EXACT_BYTES and dim % 2 == 0
+    return used + (PqIndex(table).nbytes(keyframes + CATCH_UP) if scanned else 0)
+
+
 class KeyframeRecord(Protocol):
     """A keyframe that can be saved or restored: one of the database, or one read from a map."""
 
@@ -137,7 +146,8 @@ class KeyframeDatabase:
         self.read_only = read_only
         self._eviction_name = eviction
         self._index_name = index
-        self._patch_file = PatchFile(patch_folder, int(disk_budget_gb * 1e9)) if patch_store == "disk" else None
+        self._new_file = lambda: PatchFile(patch_folder, int(disk_budget_gb * 1e9)) if patch_store == "disk" else None
+        self._patch_file = self._new_file()
         self._disk_failed = False
         self._lock = threading.Lock()
         self._session = 0
@@ -382,7 +392,9 @@ class KeyframeDatabase:
     def clear(self) -> None:
         """Forget every keyframe; ids go on counting."""
         with self._lock:
+            before = self._keyframes
             self._start_empty()
+        _let_go(before)
 
     def snapshot(self) -> Snapshot:
         """The database at this moment; costs a list, not a copy of the keyframes."""
@@ -390,42 +402,45 @@ class KeyframeDatabase:
             keyframes = [self._keyframes[i] for i in self._ids]
             return Snapshot(self._lineage, self.dim, self._next_id, self._session + 1, keyframes)
 
-    def require_room(self, keyframes: int, patch_bytes: int) -> None:
-        """Raises PnvError unless an empty database could take so many keyframes with so many bytes of patches."""
-        budget = self.bytes_budget - keyframes * (self._table.row_bytes + OBJECT_BYTES)
-        on_disk = self._patch_file.limit if self._patch_file is not None else 0
-        if budget < 0 or budget + on_disk < patch_bytes:
-            need = (self.bytes_budget - budget + patch_bytes) / MB
-            raise PnvError(
-                f"the map takes {need:.3g} MB; memory_budget_mb = {self.bytes_budget / MB:g} given; "
-                "allowed: a larger budget, patch_store = disk, or a pruned map"
-            )
+    def prepared(
+        self, keyframes: Iterable[KeyframeRecord], count: int, next_id: int, next_session: int
+    ) -> "KeyframeDatabase":
+        """A database like this one with the `count` keyframes of a saved map, by ascending id, for `become`.
 
-    def restore(self, keyframes: Iterable[KeyframeRecord], next_id: int, next_session: int) -> object:
-        """Replace the contents by keyframes of a saved map, by ascending id, and begin a new session.
-
-        Gives the lineage of later snapshots. Raises PnvError, leaving the database empty, when they exceed the budget.
+        This one is not touched and may be in use meanwhile. Raises PnvError when they exceed the budget.
         """
-        with self._lock:
-            self._start_empty()
-            try:
-                for kf in keyframes:
-                    self._take_back(kf)
-            except BaseException:
-                self._start_empty()
-                raise
-            self._next_id, self._session = next_id, next_session
-            return self._lineage
+        fresh = copy.copy(self)
+        fresh._patch_file = self._new_file()
+        fresh._start_empty()
+        for kf in keyframes:
+            fresh._take_back(kf, count)
+        fresh._next_id, fresh._session = next_id, next_session
+        return fresh
 
-    def _take_back(self, kf: KeyframeRecord) -> None:
+    def become(self, prepared: "KeyframeDatabase") -> object:
+        """Take over the contents of a `prepared` database at once. Gives the lineage of later snapshots."""
+        with self._lock:
+            before = self._keyframes
+            vars(self).update(vars(prepared) | {"read_only": self.read_only, "_evicted": self._evicted})
+            lineage = self._lineage
+        _let_go(before)
+        return lineage
+
+    def _take_back(self, kf: KeyframeRecord, count: int) -> None:
         buffer = np.frombuffer(kf.read(), np.uint8)
         while self._bytes_with(1) + len(buffer) > self.bytes_budget:
             if not self._spill():
                 raise PnvError(
-                    f"{len(self._ids)} keyframes of the map fill memory_budget_mb = {self.bytes_budget / MB:g}; "
-                    "allowed: a larger budget, or a pruned map"
+                    f"{len(self._ids)} of the map's {count} keyframes fill memory_budget_mb = "
+                    f"{self.bytes_budget / MB:g}; allowed: a larger budget, patch_store = disk, or a pruned map"
                 )
         self._insert(kf.ref, kf.vector, self._shared(kf.layouts), buffer, kf.texture)
+
+
+def _let_go(keyframes: dict[int, StoredKeyframe]) -> None:
+    """Free keyframes one by one, so that no thread waits for all of them at once."""
+    while keyframes:
+        keyframes.popitem()
 
 
 def _unit_vector(vector: NDArray, dim: int) -> NDArray[np.float32]:

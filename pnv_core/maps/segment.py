@@ -17,13 +17,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BufferedReader, FileIO
 from pathlib import Path
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.database.keyframes import KeyframeRecord
-from pnv_core.database.patch_codes import DTYPES, GridLayout, buffer_bytes, layout_of_shapes
+from pnv_core.database.patch_codes import GridLayout, buffer_bytes, layout_of_shapes
 from pnv_core.errors import MapError
+from pnv_core.files import open_regular
 from pnv_core.types import ImageRef
 
 VERSION = 1
@@ -33,8 +36,26 @@ _CHECKED = slice(8, None)  # of a record's head: all after its own checksum
 _HEADER_MAGIC, _RECORD_MAGIC = b"PNVS", b"PNVK"
 _MOST_THUMBNAIL = 1 << 20  # bytes behind the patches; a picture of 320 pixels width takes about 2**14
 _MOST_HEADER = 16_000_000  # bytes; more is damage, not a header
+_MOST_SALVAGED = 2**32  # bytes of a file that is searched; a segment ends soon after 64 MB
 
 Layouts = tuple[GridLayout, ...]
+_Number = Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
+
+
+@dataclass(frozen=True)
+class _WrittenLayout:
+    precision: Literal["float32", "float16", "int8"]
+    grids: tuple[tuple[_Number, _Number, _Number, _Number, _Number], ...]  # size, rows, cols, stride, dim
+
+
+@dataclass(frozen=True)
+class _WrittenHeader:
+    """A header as JSON holds it."""
+
+    fingerprint: str
+    dim: _Number
+    cameras: Annotated[tuple[Annotated[str, msgspec.Meta(max_length=1000)], ...], msgspec.Meta(max_length=2**16)]
+    layouts: Annotated[tuple[_WrittenLayout, ...], msgspec.Meta(max_length=2**16)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +70,11 @@ class SavedKeyframe:
 
     def read(self) -> NDArray[np.uint8]:
         return self.buffer
+
+    @property
+    def sound(self) -> bool:
+        """Whether the vector is one that a describer gives: of length 1. A checksum says nothing about that."""
+        return abs(float(np.linalg.norm(self.vector.astype(np.float64))) - 1.0) < 1e-2
 
 
 @dataclass(frozen=True)
@@ -81,21 +107,15 @@ class SegmentHeader:
     def decode(cls, body: bytes) -> "SegmentHeader":
         """Raises ValueError for JSON that is no header."""
         try:
-            given = json.loads(body)
-            layouts = tuple(_layouts(**item) for item in given["layouts"])
-            return cls(str(given["fingerprint"]), int(given["dim"]), tuple(given["cameras"]), layouts)
-        except (TypeError, KeyError, UnicodeDecodeError) as error:
-            raise ValueError(f"no segment header: {error!r}") from error
+            given = msgspec.json.decode(body, type=_WrittenHeader)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise ValueError(f"no segment header: {error}") from error
+        layouts = tuple(layout_of_shapes(item.grids, item.precision) for item in given.layouts)
+        return cls(given.fingerprint, given.dim, given.cameras, layouts)
 
     def record_bytes(self, layout: int) -> int:
         """Bytes of a record's payload."""
         return 4 * self.dim + buffer_bytes(self.layouts[layout])
-
-
-def _layouts(precision: str, grids: list[list[int]]) -> Layouts:
-    if precision not in DTYPES:
-        raise KeyError(precision)
-    return layout_of_shapes([(size, rows, cols, stride, dim) for size, rows, cols, stride, dim in grids], precision)
 
 
 class SegmentWriter:
@@ -152,19 +172,32 @@ class SegmentWriter:
         self.path.unlink(missing_ok=True)
 
 
-def read_segment(path: Path, nbytes: int, digest: int) -> Iterator[SavedKeyframe]:
-    """Every keyframe of a segment of this size and digest. Raises MapError naming the file and what is wrong."""
+def open_segment(path: Path, nbytes: int) -> BufferedReader:
+    """A segment of this size, open for reading. Raises MapError naming the file and what is wrong."""
     try:
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size != nbytes:
-                raise MapError(f"{path}: {size} bytes; allowed: {nbytes}, as saved")
-            yield from _records(path, file, digest)
+        file = open_regular(path)
+    except OSError as error:
+        raise MapError(f"{path}: {error.strerror}; allowed: the segment the map names") from error
+    size = os.fstat(file.fileno()).st_size
+    if size != nbytes:
+        file.close()
+        raise MapError(f"{path}: {size} bytes; allowed: {nbytes}, as saved")
+    return file
+
+
+def read_segment(path: Path, file: BufferedReader, digest: int) -> Iterator[tuple[SegmentHeader, SavedKeyframe]]:
+    """Every keyframe of an open segment of this digest, with its header; `path` names it in messages.
+
+    Raises MapError for what is wrong.
+    """
+    try:
+        file.seek(0)
+        yield from _records(path, file, digest)
     except OSError as error:
         raise MapError(f"{path}: {error.strerror}; allowed: the segment the map names") from error
 
 
-def _records(path: Path, file: BufferedReader, digest: int) -> Iterator[SavedKeyframe]:
+def _records(path: Path, file: BufferedReader, digest: int) -> Iterator[tuple[SegmentHeader, SavedKeyframe]]:
     first, header = _read_header(path, file)
     found = 0
     while True:
@@ -175,7 +208,7 @@ def _records(path: Path, file: BufferedReader, digest: int) -> Iterator[SavedKey
             break
         head, keyframe = _read_record(path, file, header)
         found = zlib.crc32(head, found)
-        yield keyframe
+        yield header, keyframe
     last, _ = _read_header(path, file)
     if last != first or file.read(1):
         raise MapError(f"{path}: altered at its end")
@@ -210,6 +243,8 @@ def _read_record(path: Path, file: BufferedReader, header: SegmentHeader) -> tup
     parsed = _parse(head, header)
     if parsed is None:
         raise MapError(f"{path}: the head of the keyframe at byte {at} is damaged")
+    if parsed.nbytes > os.fstat(file.fileno()).st_size:  # before so much is allocated
+        raise MapError(f"{path}: keyframe {parsed.ref.id} at byte {at} is longer than the file")
     payload = np.empty(parsed.nbytes, np.uint8)
     if file.readinto(payload.data) != parsed.nbytes or zlib.crc32(payload.data) != parsed.crc:
         raise MapError(f"{path}: keyframe {parsed.ref.id} at byte {at} is damaged")
@@ -238,13 +273,16 @@ def _parse(head: bytes, header: SegmentHeader) -> _Head | None:
         return None
     if not 0 <= nbytes - header.record_bytes(layout) <= _MOST_THUMBNAIL:
         return None
+    if not (0 <= keyframe < 2**53 and 0 <= session < 2**31 - 1 and 0.0 <= texture <= 1.0):
+        return None
     ref = ImageRef(keyframe, stamp, header.cameras[camera], session)
     return _Head(ref, layout, texture, nbytes, payload_crc)
 
 
 def salvage(path: Path) -> tuple[SegmentHeader | None, list[SavedKeyframe]]:
     """Every whole keyframe of a damaged segment, and its header if one of the two is whole. Raises OSError."""
-    data = path.read_bytes()
+    with open_regular(path) as file:
+        data = file.read(_MOST_SALVAGED)
     header = _salvage_header(data)
     if header is None:
         return None, []
@@ -283,4 +321,5 @@ def _salvage_record(data: bytes, at: int, header: SegmentHeader) -> tuple[SavedK
     payload = np.frombuffer(data[start : start + parsed.nbytes], np.uint8).copy()
     if len(payload) != parsed.nbytes or zlib.crc32(payload.data) != parsed.crc:
         return None, at + 1
-    return parsed.keyframe(payload, header), start + parsed.nbytes
+    keyframe = parsed.keyframe(payload, header)
+    return (keyframe if keyframe.sound else None), start + parsed.nbytes

@@ -11,14 +11,18 @@ import re
 from bisect import bisect
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 from pnv_core.database import KeyframeDatabase, Snapshot
 from pnv_core.database.keyframes import KeyframeRecord
 from pnv_core.errors import MapError
+from pnv_core.files import sync_folder
 from pnv_core.maps.manifest import (
+    LAST_GENERATION,
     NAME,
+    SEGMENT_NAME,
     Manifest,
     Runs,
     Segment,
@@ -28,13 +32,14 @@ from pnv_core.maps.manifest import (
     runs_of,
     write_manifest,
 )
-from pnv_core.maps.segment import SavedKeyframe, SegmentHeader, SegmentWriter, read_segment
+from pnv_core.maps.reading import open_map
+from pnv_core.maps.segment import SegmentHeader, SegmentWriter
 from pnv_core.types import ImageRef
 
 SEGMENT_BYTES = 64_000_000  # a segment is closed beyond this, so that a rolling map frees disk in small steps
 _SMALL_BYTES, _MANY_SMALL = 8_000_000, 16  # so many segments smaller than this are written anew as one
 _LOCK = "lock"
-_OURS = re.compile(r"segment-\d{8}-\d{4}\.pnv|" + re.escape(NAME) + r"(\.new)?|" + _LOCK)
+_OURS = re.compile(SEGMENT_NAME + "|" + re.escape(NAME) + r"(\.new)?|" + _LOCK)
 
 
 @dataclass(frozen=True)
@@ -45,9 +50,11 @@ class SaveReport:
     keyframes: int
     written: int  # keyframes written anew
     bytes_written: int
+    kept: Path | None = None  # where the map is now that was there before and that this one does not continue
 
     def __str__(self) -> str:
-        return f"{self.path}: {self.keyframes} keyframes, {self.written} new ({self.bytes_written / 1e6:.1f} MB)"
+        kept = "" if self.kept is None else f"; the map before a reset or load is kept at {self.kept}"
+        return f"{self.path}: {self.keyframes} keyframes, {self.written} new ({self.bytes_written / 1e6:.1f} MB){kept}"
 
 
 class MapStore:
@@ -72,53 +79,65 @@ class MapStore:
         """Verify the whole map, then replace the database's contents by it and begin a new session.
 
         Raises MapError for a map that is damaged or of another model, PnvError for one beyond the memory budget; the
-        database is then as it was.
+        database is then as it was. Until the map is whole in memory the one before is held as well.
         """
-        manifest = read_manifest(self.path)
-        if manifest.fingerprint != self.fingerprint:
-            raise MapError(
-                f"{self.path} was made with model {manifest.fingerprint}; this is model {self.fingerprint}; "
-                "allowed: a map of the same model, image size and patch sizes"
-            )
-        if manifest.dim != database.dim:
-            raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")
-        database.require_room(manifest.keyframes, sum(len(kf.buffer) for kf in keyframes_of(self.path, manifest)))
-        keyframes = keyframes_of(self.path, manifest)
-        self._known = None  # should the restoring fail, the map on disk is not overwritten by what is left
-        self._lineage = database.restore(keyframes, manifest.next_id, manifest.next_session)
-        self._known = manifest
+        manifest, prepared = self.read(database)
+        self.put(database, manifest, prepared)
         return manifest
+
+    def read(self, database: KeyframeDatabase) -> tuple[Manifest, KeyframeDatabase]:
+        """The map on disk as a database like this one, which stays as it is and in use. Raises as `load` does."""
+        with open_map(self.path) as opened:
+            manifest = opened.manifest
+            if manifest.fingerprint != self.fingerprint:
+                raise MapError(
+                    f"{self.path} was made with model {manifest.fingerprint}; this is model {self.fingerprint}; "
+                    "allowed: a map of the same model, image size and patch sizes"
+                )
+            if manifest.dim != database.dim:
+                raise MapError(f"{self.path} has vectors of {manifest.dim} dimensions; allowed: {database.dim}")
+            return manifest, database.prepared(
+                opened.keyframes(), manifest.keyframes, manifest.next_id, manifest.next_session
+            )
+
+    def put(self, database: KeyframeDatabase, manifest: Manifest, prepared: KeyframeDatabase) -> None:
+        """Replace the database's contents by what `read` gave."""
+        self._lineage = database.become(prepared)
+        self._known = manifest
 
     def save(self, snapshot: Snapshot) -> SaveReport:
         """Make the map on disk equal to the snapshot, which is used up.
 
-        Raises MapError (no space, no permission, a map not to be overwritten, another process saving); the map saved
-        before is then as it was.
+        A map of this store that the snapshot does not continue, because the database was emptied or loaded from
+        elsewhere, is kept in a folder beside it. Raises MapError (no space, no permission, a map not to be
+        overwritten, another process saving); the map saved before is then as it was.
         """
         with locked(self.path):
-            known = self._known_on_disk(snapshot)
+            known, before = self._known_on_disk(snapshot)
             try:
+                kept = _kept_aside(self.path, before) if before is not None else None
                 manifest, report = self._write(snapshot, known)
             except OSError as error:
                 raise MapError(
                     f"cannot save {self.path}: {error.strerror or error}; what was saved before is whole"
                 ) from error
         self._known, self._lineage = manifest, snapshot.lineage
-        return report
+        return replace(report, kept=kept)
 
-    def _known_on_disk(self, snapshot: Snapshot) -> Manifest | None:
-        """The map on disk if the snapshot continues it."""
+    def _known_on_disk(self, snapshot: Snapshot) -> tuple[Manifest | None, Manifest | None]:
+        """The map on disk if the snapshot continues it, else None; and the one to be kept beside, if any."""
         if not self.exists():
-            return None
+            return None, None
         on_disk = read_manifest(self.path)
-        if on_disk == self._known and self._lineage is snapshot.lineage:
-            return on_disk
-        if on_disk != self._known and not self._replace:
+        if on_disk == self._known:
+            continued = self._lineage is snapshot.lineage
+            return (on_disk, None) if continued else (None, on_disk if on_disk.keyframes else None)
+        if not self._replace:
             raise MapError(
                 f"{self.path} holds a map of {on_disk.keyframes} keyframes that was not loaded; "
                 "allowed: load it first, another path, or replace"
             )
-        return None
+        return None, None
 
     def _write(self, snapshot: Snapshot, known: Manifest | None) -> tuple[Manifest, SaveReport]:
         live: dict[int, KeyframeRecord] = {kf.ref.id: kf for kf in snapshot.keyframes}
@@ -138,7 +157,7 @@ class MapStore:
             and (known.next_id, known.next_session) == (snapshot.next_id, snapshot.next_session)
         ):
             return known, SaveReport(self.path, keyframes, 0, 0)
-        generation = _last_generation(self.path) + 1
+        generation = _next_generation(self.path)
         header = SegmentHeader(
             self.fingerprint, snapshot.dim, cameras, tuple({kf.layouts: None for kf in live.values()})
         )
@@ -251,27 +270,30 @@ def _remove(folder: Path, names: Iterable[str]) -> None:
             os.unlink(folder / name)
 
 
-def _last_generation(folder: Path) -> int:
-    """The largest number any file there carries, so that no name is used twice."""
-    return max((int(path.name[8:16]) for path in segment_files(folder)), default=0)
+def _next_generation(folder: Path) -> int:
+    """A number above that of the map there which no file carries yet. Raises MapError when there is none left."""
+    known = read_manifest(folder).generation if (folder / NAME).exists() else 0
+    taken = {path.name[8:16] for path in segment_files(folder)}
+    number = next(n for n in count(known + 1) if f"{n:08d}" not in taken)
+    if number > LAST_GENERATION:
+        raise MapError(f"{folder} was saved {known} times; allowed: {LAST_GENERATION}; save to another path")
+    return number
+
+
+def _kept_aside(folder: Path, manifest: Manifest) -> Path:
+    """A folder beside that holds the same map: its files by second names, which costs no space. Raises OSError."""
+    aside = next(p for n in count(1) if not (p := folder.with_name(f"{folder.name}.before-{n}")).exists())
+    os.mkdir(aside)
+    for name in (*(s.file for s in manifest.segments), NAME):  # the manifest last: until then it is no map
+        os.link(folder / name, aside / name)
+    sync_folder(aside)
+    sync_folder(aside.parent)
+    return aside
 
 
 def segment_files(folder: Path) -> list[Path]:
     """Every segment file there, named by a manifest or not, oldest first."""
     return sorted(path for path in folder.glob("segment-*.pnv") if _OURS.fullmatch(path.name))
-
-
-def keyframes_of(folder: Path, manifest: Manifest) -> Iterator[SavedKeyframe]:
-    """The keyframes of a map by ascending id, each checked. Raises MapError at the first that is not whole."""
-    count = 0
-    for segment in manifest.segments:
-        live = set(ids_of(segment.live))
-        for kf in read_segment(folder / segment.file, segment.bytes, segment.digest):
-            if kf.ref.id in live:
-                count += 1
-                yield kf
-    if count != manifest.keyframes:
-        raise MapError(f"{folder}: {count} keyframes found; allowed: {manifest.keyframes}, as saved")
 
 
 @contextmanager
@@ -284,9 +306,10 @@ def locked(folder: Path) -> Iterator[None]:
             raise MapError(
                 f"{folder} holds {strangers[0]!r}, which is no part of a map; allowed: a new or a map folder"
             )
-        handle = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR, 0o644)
-    except OSError as error:
-        raise MapError(f"cannot save {folder}: {error.strerror}; allowed: a writable folder") from error
+        handle = os.open(folder / _LOCK, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        why = getattr(error, "strerror", None) or error
+        raise MapError(f"cannot save {folder}: {why}; allowed: a writable folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,30 +1,34 @@
 """What is done with maps at rest: verify, merge, prune, recover, export. Every result is a new map or file."""
 
 import csv
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pnv_core.database.eviction import make_eviction
+from pnv_core.database.keyframes import bytes_needed
 from pnv_core.database.patch_codes import PatchCodes, views
-from pnv_core.errors import MapError
-from pnv_core.maps.manifest import NAME, Manifest, read_manifest
+from pnv_core.errors import ConfigError, MapError
+from pnv_core.maps.manifest import NAME, Manifest, holds, read_manifest
+from pnv_core.maps.reading import open_map
 from pnv_core.maps.segment import Layouts, SavedKeyframe, SegmentHeader, salvage
-from pnv_core.maps.store import commit, keyframes_of, locked, segment_files, sessions_of, write_segments
+from pnv_core.maps.store import commit, locked, segment_files, sessions_of, write_segments
 from pnv_core.types import ImageRef
 
 
 def verify(path: Path) -> Manifest:
     """Read and check every byte of a map. Raises MapError naming the file and what is wrong."""
-    manifest = read_manifest(path)
-    for _ in keyframes_of(path, manifest):
-        pass
-    return manifest
+    with open_map(path) as opened:
+        for _ in opened.keyframes():
+            pass
+        return opened.manifest
 
 
 def merge(first: Path, second: Path, output: Path) -> Manifest:
@@ -32,17 +36,20 @@ def merge(first: Path, second: Path, output: Path) -> Manifest:
 
     Raises MapError for a damaged map, for maps of two models, or an output that exists.
     """
-    a, b = verify(first), verify(second)
-    if a.fingerprint != b.fingerprint:
-        raise MapError(f"{first} is of model {a.fingerprint}, {second} of {b.fingerprint}; allowed: maps of one model")
+    with open_map(first) as one, open_map(second) as other:
+        a, b = one.manifest, other.manifest
+        if a.fingerprint != b.fingerprint:
+            raise MapError(
+                f"{first} is of model {a.fingerprint}, {second} of {b.fingerprint}; allowed: maps of one model"
+            )
 
-    def keyframes() -> Iterator[SavedKeyframe]:
-        yield from keyframes_of(first, a)
-        for kf in keyframes_of(second, b):
-            ref = replace(kf.ref, id=kf.ref.id + a.next_id, session=kf.ref.session + a.next_session)
-            yield replace(kf, ref=ref)
+        def keyframes() -> Iterator[SavedKeyframe]:
+            yield from one.keyframes()
+            for kf in other.keyframes():
+                ref = replace(kf.ref, id=kf.ref.id + a.next_id, session=kf.ref.session + a.next_session)
+                yield replace(kf, ref=ref)
 
-    return _write_map(output, a, keyframes, a.next_id + b.next_id, a.next_session + b.next_session)
+        return _write_map(output, a, keyframes, a.next_id + b.next_id, a.next_session + b.next_session)
 
 
 def prune(
@@ -54,33 +61,39 @@ def prune(
     drop_sessions: Iterable[int] = (),
     eviction: str = "densest",
 ) -> Manifest:
-    """The map without some sessions, thinned by an eviction policy to `keep` keyframes or `budget_mb` of keyframes.
+    """The map without some sessions, thinned by an eviction policy to `keep` keyframes or a `memory_budget_mb`.
 
-    Raises MapError for a damaged map, a session that is not in it, or an output that exists.
+    Raises MapError for a damaged map, a session that is not in it, or an output that exists; ConfigError for a
+    number below zero or not finite.
     """
-    manifest = verify(path)
-    dropped = set(drop_sessions)
-    unknown = dropped - {s.session for s in manifest.sessions}
-    if unknown:
-        allowed = ", ".join(str(s.session) for s in manifest.sessions)
-        raise MapError(f"session {min(unknown)} is not in {path}; allowed: {allowed}")
-    policy = make_eviction(eviction)
-    refs, sizes = {}, {}
-    for kf in keyframes_of(path, manifest):
-        if kf.ref.session not in dropped:
-            refs[kf.ref.id], sizes[kf.ref.id] = kf.ref, kf.vector.nbytes + len(kf.buffer)
-            policy.added(kf.ref, np.array(kf.vector))
-    total = sum(sizes.values())
-    most = len(refs) if keep is None else keep
-    while len(refs) > most or (budget_mb is not None and refs and total > budget_mb * 1e6):
-        gone = policy.choose()
-        policy.removed(refs.pop(gone))
-        total -= sizes[gone]
+    for name, number in (("keep", keep), ("budget_mb", budget_mb)):
+        if number is not None and not 0 <= number < math.inf:
+            raise ConfigError(f"{name} = {number}; allowed: a number of at least 0")
+    with open_map(path) as opened:
+        manifest = opened.manifest
+        dropped = set(drop_sessions)
+        unknown = dropped - {s.session for s in manifest.sessions}
+        if unknown:
+            allowed = ", ".join(str(s.session) for s in manifest.sessions)
+            raise MapError(f"session {min(unknown)} is not in {path}; allowed: {allowed}")
+        policy = make_eviction(eviction)
+        refs, sizes = {}, {}
+        for kf in opened.keyframes():
+            if kf.ref.session not in dropped:
+                refs[kf.ref.id], sizes[kf.ref.id] = kf.ref, len(kf.buffer)
+                policy.added(kf.ref, np.array(kf.vector))
+        patches = sum(sizes.values())
+        most = len(refs) if keep is None else keep
+        budget = math.inf if budget_mb is None else budget_mb * 1e6
+        while refs and (len(refs) > most or bytes_needed(manifest.dim, len(refs), patches) > budget):
+            gone = policy.choose()
+            policy.removed(refs.pop(gone))
+            patches -= sizes[gone]
 
-    def keyframes() -> Iterator[SavedKeyframe]:
-        return (kf for kf in keyframes_of(path, manifest) if kf.ref.id in refs)
+        def keyframes() -> Iterator[SavedKeyframe]:
+            return (kf for kf in opened.keyframes() if kf.ref.id in refs)
 
-    return _write_map(output, manifest, keyframes, manifest.next_id, manifest.next_session)
+        return _write_map(output, manifest, keyframes, manifest.next_id, manifest.next_session)
 
 
 @dataclass(frozen=True)
@@ -110,20 +123,16 @@ def recover(path: Path, output: Path) -> Recovery:
     if not found.keyframes or found.header is None:
         raise MapError(f"{path}: no whole keyframe found; nothing to recover")
     ids = sorted(found.keyframes)
-    last_session = max(found.keyframes[i][1] for i in ids)
-    base = manifest or Manifest(
-        found.header.fingerprint, found.header.dim, 0, ids[-1] + 1, last_session + 1, 0, (), (), ()
-    )
+    next_session = 1 + max(session for _, session in found.keyframes.values())
+    base = manifest or Manifest(found.header.fingerprint, found.header.dim, 0, ids[-1] + 1, next_session, 0, (), (), ())
 
     def keyframes() -> Iterator[SavedKeyframe]:
-        by_file: dict[Path, list[int]] = {}
-        for i in ids:
-            by_file.setdefault(found.keyframes[i][0], []).append(i)
-        for file in sorted(by_file, key=lambda f: by_file[f][0]):
-            wanted = set(by_file[file])
-            yield from (kf for kf in salvage(file)[1] if kf.ref.id in wanted)
+        for file, run in groupby(ids, lambda i: found.keyframes[i][0]):  # ids of segments do not interleave
+            wanted = dict.fromkeys(run)
+            whole = {kf.ref.id: kf for kf in salvage(file)[1] if kf.ref.id in wanted}
+            yield from (whole[i] for i in wanted)
 
-    _write_map(output, base, keyframes, base.next_id, base.next_session)
+    _write_map(output, base, keyframes, base.next_id, max(base.next_session, next_session))
     return Recovery(len(ids), manifest.keyframes - len(ids) if manifest else None, tuple(problems))
 
 
@@ -153,8 +162,7 @@ def _salvage_all(files: list[Path], manifest: Manifest | None, problems: list[st
             continue
         found.header = found.header or header
         for kf in keyframes:
-            wanted = live is None or any(first <= kf.ref.id <= last for first, last in live[file.name])
-            if wanted:
+            if live is None or holds(live[file.name], kf.ref.id):
                 found.keyframes.setdefault(kf.ref.id, (file, kf.ref.session))
     return found
 
@@ -198,19 +206,20 @@ def _write_map(
 
 def export_csv(path: Path, output: Path) -> int:
     """One row per keyframe: id, session, camera, stamp. Gives the number of rows. Raises MapError."""
-    manifest = verify(path)
+    with open_map(path) as opened:
 
-    def write(aside: Path) -> None:
-        with open(aside, "w", newline="") as file:
-            rows = csv.writer(file)
-            rows.writerow(["id", "session", "camera", "stamp_ns", "stamp", "texture"])
-            for kf in keyframes_of(path, manifest):
-                seconds, nanoseconds = divmod(kf.ref.stamp_ns, 10**9)
-                stamp = f"{seconds}.{nanoseconds:09d}"
-                rows.writerow([kf.ref.id, kf.ref.session, kf.ref.camera, kf.ref.stamp_ns, stamp, f"{kf.texture:.6g}"])
+        def write(aside: Path) -> None:
+            with open(aside, "w", newline="") as file:
+                rows = csv.writer(file)
+                rows.writerow(["id", "session", "camera", "stamp_ns", "stamp", "texture"])
+                for kf in opened.keyframes():
+                    ref = kf.ref
+                    seconds, nanoseconds = divmod(ref.stamp_ns, 10**9)
+                    stamp = f"{seconds}.{nanoseconds:09d}"
+                    rows.writerow([ref.id, ref.session, ref.camera, ref.stamp_ns, stamp, f"{kf.texture:.6g}"])
 
-    _write_aside(output, write)
-    return manifest.keyframes
+        _write_aside(output, write)
+        return opened.manifest.keyframes
 
 
 def export_npz(path: Path, output: Path, *, patches: bool = False) -> int:
@@ -219,18 +228,18 @@ def export_npz(path: Path, output: Path, *, patches: bool = False) -> int:
 
     Raises MapError, also where patch grids differ between keyframes.
     """
-    manifest = verify(path)
     columns: dict[str, list[Any]] = {
         key: [] for key in ("ids", "stamps_ns", "sessions", "cameras", "textures", "global")
     }
     grids: dict[str, list[Any]] = {}
-    for kf in keyframes_of(path, manifest):
-        ref = kf.ref
-        row = (ref.id, ref.stamp_ns, ref.session, ref.camera, kf.texture, kf.vector)
-        for column, value in zip(columns.values(), row, strict=True):
-            column.append(value)
-        for codes in views(kf.buffer, kf.layouts) if patches else ():
-            _append_grid(path, grids, codes)
+    with open_map(path) as opened:
+        for kf in opened.keyframes():
+            ref = kf.ref
+            row = (ref.id, ref.stamp_ns, ref.session, ref.camera, kf.texture, kf.vector)
+            for column, value in zip(columns.values(), row, strict=True):
+                column.append(value)
+            for codes in views(kf.buffer, kf.layouts) if patches else ():
+                _append_grid(path, grids, codes)
     arrays = {key: np.array(values) for key, values in (columns | grids).items()}
     for key in [key for key in arrays if key.startswith("grid_")]:
         arrays[key] = arrays[key][0]
@@ -240,7 +249,7 @@ def export_npz(path: Path, output: Path, *, patches: bool = False) -> int:
             np.savez(file, **arrays)  # type: ignore[arg-type]
 
     _write_aside(output, write)
-    return manifest.keyframes
+    return len(columns["ids"])
 
 
 def _append_grid(path: Path, grids: dict[str, list[Any]], codes: PatchCodes) -> None:

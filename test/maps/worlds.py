@@ -6,8 +6,7 @@ import numpy as np
 
 from pnv_core.database import KeyframeDatabase
 from pnv_core.maps import MapStore
-from pnv_core.maps.manifest import read_manifest
-from pnv_core.maps.store import keyframes_of
+from pnv_core.maps.reading import open_map
 from test.database.synthetic import SECOND, place
 
 MODEL = "f" * 16
@@ -45,7 +44,8 @@ def contents(database: KeyframeDatabase) -> list[tuple]:
 
 
 def on_disk(path: Path) -> list[tuple]:
-    return [_facts(kf) for kf in keyframes_of(path, read_manifest(path))]
+    with open_map(path) as opened:
+        return [_facts(kf) for kf in opened.keyframes()]
 
 
 def _facts(kf) -> tuple:

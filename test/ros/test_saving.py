@@ -2,7 +2,8 @@
 
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
 
 import pytest
 import rclpy
@@ -13,11 +14,14 @@ from pnv_core.errors import ConfigError, MapError
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.saved_map import SavedMap
 from pnv_ros.services import Services
+from test.maps.worlds import MODEL, contents, driven, go_on, on_disk
 from test.ros.processes import wait_until
 
 
 class SlowStore:
     """A store whose save takes until it is told to end."""
+
+    path = Path("map")
 
     def __init__(self):
         self.writing, self.end = threading.Event(), threading.Event()
@@ -27,7 +31,10 @@ class SlowStore:
         assert self.end.wait(30)
         return "report"
 
-    def load(self, _database):
+    def read(self, _database):
+        return None, None
+
+    def put(self, *_):
         pass
 
 
@@ -66,6 +73,40 @@ def test_recognition_is_not_held_still_while_a_load_waits_for_a_save(slow_map):
     store.end.set()
     loading.join(30)
     assert entered.is_set()
+
+
+def test_a_path_that_was_left_and_taken_again_is_saved_to_and_loaded_from(tmp_path):
+    database = driven(10)
+    saved_map = SavedMap(database, MODEL)
+    for number, name in enumerate(["a", "b", "a", "a/", "b", "a"]):
+        saved_map.path = str(tmp_path) + "/" + name
+        go_on(database, 1, number)
+        saved_map.save()
+        assert on_disk(tmp_path / name) == contents(database)
+    before = contents(database)
+    saved_map.path = str(tmp_path / "b")
+    assert saved_map.load(nullcontext(), lambda: None) == 15
+    saved_map.path = str(tmp_path / "a")
+    saved_map.save()  # of the map loaded from b: that of a is kept
+    assert on_disk(tmp_path / "a.before-1") == before
+
+
+def test_frames_go_on_while_a_map_is_read(tmp_path):
+    database = driven(5)
+    saved_map = SavedMap(database, MODEL)
+    saved_map.path = str(tmp_path / "map")
+    saved_map.save()
+    seen = []
+
+    @contextmanager
+    def still():
+        seen.append(len(database))
+        yield
+        seen.append(len(database))
+
+    go_on(database, 2, 1)
+    saved_map.load(still(), lambda: None)
+    assert seen == [7, 5]
 
 
 class SlowControls:
