@@ -8,6 +8,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+MESSAGES := .venv/.messages
 
 # torch of PyPI carries CUDA (about 3 GB); this release is taken without it wherever an index offers it so (version +cpu).
 TORCH := torch==2.13.0
@@ -16,7 +17,7 @@ REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/to
 
 .PHONY: install demo slam-demo test bench lint clean
 
-install: $(READY)
+install: $(READY) $(MESSAGES)
 
 $(READY): setup.py setup.cfg pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
@@ -24,7 +25,11 @@ $(READY): setup.py setup.cfg pyproject.toml
 	$(BIN)/python -c "import torch" 2>/dev/null || \
 	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q $(TORCH) --extra-index-url $(TORCH_CPU); \
 	    else $(BIN)/pip install --progress-bar off -q $(TORCH); fi
-	$(BIN)/pip install --progress-bar off -q -e ".[ros,dev]"
+	$(BIN)/pip install --progress-bar off -q -e ".[ros,dev,interfaces]"
+	touch $@
+
+$(MESSAGES): $(READY) $(wildcard pnv_msgs/* pnv_msgs/*/*)
+	$(BIN)/python .ci/build_interfaces.py pnv_msgs
 	touch $@
 
 demo: $(READY)

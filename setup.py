@@ -28,6 +28,17 @@ ROS = [
     "ros-jazzy-common-interfaces==5.3.6",  # message packages generated for the rclpy above
 ]
 
+INTERFACES = [  # what building pnv_msgs needs where there is no ROS installation; of the same set as the wheels above
+    *(
+        f"ros-jazzy-{name}"
+        for name in (
+            "ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-include-directories",
+            "ament-cmake-pytest", "ament-cmake-ros", "ament-package", "python-cmake-module",
+            "rosidl-core-generators", "rosidl-default-generators", "rosidl-default-runtime",
+        )
+    ),
+]  # fmt: skip
+
 DASK = ["distributed>=2024.1"]  # evaluation on several machines; lighter than Ray
 
 DEVELOPMENT = [
@@ -70,7 +81,7 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*")),
     ],
     install_requires=REQUIRED,
-    extras_require={"ros": ROS, "dev": DEVELOPMENT, "slam": SLAM, "dask": DASK},
+    extras_require={"ros": ROS, "interfaces": INTERFACES, "dev": DEVELOPMENT, "slam": SLAM, "dask": DASK},
     entry_points={
         "console_scripts": [
             "place_recognizer = pnv_ros.place_recognizer:main",

@@ -15,6 +15,7 @@ from msg_adapters.lio_sam import LioSamGate
 from msg_adapters.loop_closures import candidates_to_message, closure_to_lio_sam, closures_to_message
 from msg_adapters.pictures import rgb_to_message
 from msg_adapters.relative_pose import relative_pose_to_message
+from msg_adapters.typed_closures import closures_to_typed, typed_type
 from pnv_core.drawing import draw_match
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
@@ -43,6 +44,8 @@ class Outputs:
         self._relative_pose = node.create_publisher(PoseWithCovarianceStamped, "~/relative_pose", TABLE_QOS)
         self._candidates = node.create_publisher(PointCloud2, "~/candidates", TABLE_QOS)
         self._match_image = node.create_publisher(Image, "~/match_image", PICTURE_QOS)
+        typed = typed_type()
+        self._typed = node.create_publisher(typed, "~/closures", CLOSURES_QOS) if typed else None
         self._lio_sam_gate = LioSamGate()
 
     def close(self) -> None:
@@ -50,6 +53,8 @@ class Outputs:
             self._closures, self._lio_sam, self._relative_pose, self._candidates, self._match_image
         ):  # fmt: skip
             self._node.destroy_publisher(publisher)
+        if self._typed is not None:
+            self._node.destroy_publisher(self._typed)
         self.markers.close()
 
     def new_session(self) -> None:
@@ -64,7 +69,7 @@ class Outputs:
         if accepted:
             self._closures.publish(closures_to_message(accepted, self._cameras))
             self._publish_lio_sam(accepted)
-            self._publish_relative_pose(accepted[0])
+            self._publish_relative_pose(accepted)
             self.markers.add(accepted)
         if self.config.publish_candidates and self._candidates.get_subscription_count():
             self._candidates.publish(candidates_to_message(closures, self._cameras, self.config.frame_id))
@@ -79,12 +84,16 @@ class Outputs:
         if best is not None:
             self._lio_sam.publish(closure_to_lio_sam(best))
 
-    def _publish_relative_pose(self, best: LoopClosure) -> None:
-        if self._poses is None or not self._relative_pose.get_subscription_count():
-            return
-        pose = self._poses.of(best)
+    def _publish_relative_pose(self, accepted: Sequence[LoopClosure]) -> None:
+        """The best closure's pose, where somebody wants it, by itself and in the typed twin."""
+        heard = self._relative_pose.get_subscription_count()
+        heard += self._typed.get_subscription_count() if self._typed is not None else 0
+        pose = self._poses.of(accepted[0]) if self._poses is not None and heard else None
         if pose is not None and pose.metric:
-            self._relative_pose.publish(relative_pose_to_message(best, pose))
+            self._relative_pose.publish(relative_pose_to_message(accepted[0], pose))
+        if self._typed is not None:
+            robot = self._node.get_namespace().strip("/")
+            self._typed.publish(closures_to_typed(accepted, {} if pose is None else {0: pose}, robot))
 
     def _picture(self, frame: Frame, closure: LoopClosure, reference: bytes) -> Image:
         verdict = "accepted" if closure.accepted else f"refused: {closure.reason}"

@@ -137,6 +137,7 @@ match is reported with both profiles and the override to set.
 | topic | type | QoS | when |
 | --- | --- | --- | --- |
 | `loop_closures` | std_msgs/Float64MultiArray | {closures_qos} | per query with an accepted closure |
+| `~/closures` | pnv_msgs/LoopClosureArray | {closures_qos} | as `loop_closures`, where pnv_msgs is installed |
 | `~/lio_sam` | std_msgs/Float64MultiArray | {table_qos} | best closure, limited by `lio_sam_interval_s` |
 | `~/relative_pose` | geometry_msgs/PoseWithCovarianceStamped | {table_qos} | best closure, where its scale is known |
 | `~/candidates` | sensor_msgs/PointCloud2 | {table_qos} | per query, while somebody subscribes |
@@ -149,6 +150,10 @@ joined by commas, C, C). Columns: {columns}. Columns 0 and 1 are epoch seconds o
 match older; the exact stamp is (floor(column 0), column 5) and (floor(column 1), column 6). Cameras are indices into
 `image_topics`; -1 is a camera of a loaded map that is not among them. Columns are only ever appended.
 `msg_adapters.loop_closures.closures_from_message` reads it.
+
+**`~/closures`**: the typed twin of `loop_closures`, the same closures at the same moments, with cameras by name,
+session and robot (the node's namespace), and the relative pose of the best one while somebody subscribes. It is
+published where the package pnv_msgs can be imported; all else works without it. `pnv_msgs/msg` explains the fields.
 
 **`~/lio_sam`**: exactly two doubles, query and match in epoch seconds, at least `lio_sam_gap_s` apart and
 of the same session: LIO-SAM knows the stamps of its own run only, so nothing is sent about the places of a loaded map.

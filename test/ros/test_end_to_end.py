@@ -9,6 +9,7 @@ from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64MultiArray
 
 from msg_adapters.loop_closures import closures_from_message
+from msg_adapters.typed_closures import closures_from_typed, typed_type
 from pnv_ros.outputs import CLOSURES_QOS
 from test.ros.processes import publisher, running_node, wait_until
 from test.ros.tables import rows_of
@@ -42,6 +43,7 @@ def test_closures_of_a_robot_driving_laps_arrive_with_the_stamps_of_its_images(s
     by_stamp = {stamps[n]: n for n in names}
 
     arrived = listener.collect(Float64MultiArray, "/loop_closures", CLOSURES_QOS)
+    typed = listener.collect(typed_type(), "/place_recognizer/closures", CLOSURES_QOS) if typed_type() else None
     every_frame = {"min_interval_s": 0.0, "min_change": 0.0}
     with running_node(exclude_recent_s=10, accept_score=0.0, consistency=0, **every_frame, **RELIABLE) as node:
         assert publisher("--reliable", "--stamps", table, "--rate", "4").wait() == 0
@@ -49,6 +51,12 @@ def test_closures_of_a_robot_driving_laps_arrive_with_the_stamps_of_its_images(s
         assert node.end(signal.SIGINT) == 0
         assert "Traceback" not in node.output
 
+    if typed is not None:
+        wait_until(lambda: len(typed) == len(arrived), 10, "the typed twin")
+        twins = [closures_from_message(m, ["camera/image_raw"]) for m in arrived]
+        assert [[(c.query, c.match) for c in closures_from_typed(m)] for m in typed] == [
+            [(c.query, c.match) for c in closures] for closures in twins
+        ]
     right = 0
     for message in arrived:
         closures = closures_from_message(message)
