@@ -66,9 +66,9 @@ class PlaceRecognizer:
             )
         limit = self.budget.affordable(len(candidates), self.config.time_budget_ms / 1e3)
         with self.timer.stage("rerank"), self.budget.taken(limit):
-            known = [(ref, similarity, self.database.descriptor(ref.id)) for ref, similarity in candidates]
+            known = [self.database.descriptor(ref.id) for ref, _ in candidates[:limit]]
             query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
-            closures = self.judge.judged(query, descriptor, predecessor, known, self.config, limit)
+            closures = self.judge.judged(query, descriptor, predecessor, candidates, known, self.config)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)

@@ -13,7 +13,7 @@ from pnv_core.verify.verifier import VERIFIERS, hull_area
 
 _NEIGHBOURS = 10  # keyframes this close in number show one place
 
-Candidate = tuple[ImageRef, float, PlaceDescriptor]  # keyframe, similarity, descriptor
+Candidate = tuple[ImageRef, float]  # keyframe, similarity
 
 
 class Judge:
@@ -30,24 +30,21 @@ class Judge:
         descriptor: PlaceDescriptor,
         predecessor: float,
         candidates: Sequence[Candidate],
+        references: Sequence[PlaceDescriptor],
         config: Config,
-        limit: int | None = None,
     ) -> list[LoopClosure]:
         """A LoopClosure per candidate, best first, none accepted yet.
 
-        Those beyond the first `limit` are refused as not re-ranked.
+        `references` is what is stored of the first candidates; the others are refused as not re-ranked.
         `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
         `config.verify` best are examined by local features where both images have a thumbnail. An image with less
         texture than `config.min_texture` scores 0.
         """
-        examined = candidates[:limit]
-        results = self.reranker.scores(descriptor, [reference for _, _, reference in examined])
-        scored = dict(enumerate(results))
-        left_out = range(len(examined), len(candidates))
+        scored = self.reranker.scores(descriptor, references)
         found = []
-        for number, result in scored.items():
-            ref, similarity, reference = candidates[number]
-            elsewhere = [i for i, (other, _, _) in enumerate(candidates) if _apart(other, ref)]
+        for number, (result, reference) in enumerate(zip(scored, references, strict=True)):
+            ref, similarity = candidates[number]
+            elsewhere = [i for i, (other, _) in enumerate(candidates) if _apart(other, ref)]
             evidence = Evidence(
                 similarity=similarity,
                 spatial=result.score,
@@ -56,17 +53,17 @@ class Judge:
                 distortion=distortion(descriptor, reference, result.matches),
                 lead=min((similarity - candidates[i][1] for i in elsewhere), default=0.0),
                 recent_lead=similarity - predecessor,
-                spatial_lead=min((result.score - scored[i].score for i in elsewhere if i in scored), default=0.0),
+                spatial_lead=min((result.score - scored[i].score for i in elsewhere if i < len(scored)), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
         found.sort(key=lambda pair: _rank(pair[0]))
         if descriptor.thumbnail and config.verify:
-            pictures = [(candidates[i][2].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
+            pictures = [(references[i].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
             shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
             self.verifier.prepare(shown, self.reranker.workers)
         for place, (closure, evidence, number) in enumerate(found[: config.verify]):
-            picture = candidates[number][2].thumbnail
+            picture = references[number].thumbnail
             if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
                 seen = replace(evidence, local_inliers=check.inliers, local_spread=check.spread)
@@ -75,7 +72,7 @@ class Judge:
         # what ranked lower and was not examined is not believed more than what was
         most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
         closures = [c if e.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c, e, _ in found]
-        rest = [_not_reranked(query, *candidates[i], descriptor.texture) for i in left_out]
+        rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
         return sorted(closures + rest, key=_rank)
 
     def _closure(
@@ -88,10 +85,8 @@ class Judge:
         )  # fmt: skip
 
 
-def _not_reranked(
-    query: ImageRef, match: ImageRef, similarity: float, reference: PlaceDescriptor, texture: float
-) -> LoopClosure:
-    evidence = Evidence(similarity=similarity, spatial=0.0, inliers=0, texture=min(texture, reference.texture))
+def _not_reranked(query: ImageRef, match: ImageRef, similarity: float, texture: float) -> LoopClosure:
+    evidence = Evidence(similarity=similarity, spatial=0.0, inliers=0, texture=texture)
     return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
 
 

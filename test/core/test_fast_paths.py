@@ -226,13 +226,17 @@ def test_candidates_beyond_the_budget_are_reported_as_not_re_ranked():
         return scores(query, references)
 
     recogniser.judge.reranker.scores = slow
+    read, descriptor = [], recogniser.database.descriptor
+    recogniser.database.descriptor = lambda keyframe: read.append(keyframe) or descriptor(keyframe)
     rng = np.random.default_rng(7)
     for second in range(6):
         image = rng.integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+        read.clear()
         closures = recogniser.process(Frame(second * 10**9, "camera", image))
     left_out = [c for c in closures if c.reason is Reason.NOT_RERANKED]
     assert len(closures) == 5
     assert len(left_out) == 3
+    assert sorted(read) == sorted({c.match.id for c in closures} - {c.match.id for c in left_out})  # perhaps from disk
     assert not any(c.accepted for c in left_out)
 
 
