@@ -7,7 +7,7 @@ spread never lower the score. It was fitted on pairs of known truth, so its outp
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,8 @@ class Logistic:
 class Calibration:
     """P(same place) of candidates that only their patches speak for, and of those that local features verified.
 
-    It holds for the scorer, patch sizes and image size it was fitted with.
+    It holds for the settings it was fitted with that shape the evidence. What a file does not name is as it was for all
+    models before it was recorded: strides of 1, the default `scale_weight` and verifier, any fusion weights.
     """
 
     patches: Logistic
@@ -73,15 +74,21 @@ class Calibration:
     patch_sizes: tuple[int, ...] = ()
     image_size: tuple[int, int] = (0, 0)
     source: str = ""  # what it was fitted on
+    patch_strides: tuple[int, ...] = ()
+    patch_weights: tuple[float, ...] = ()
+    scale_weight: float = 0.3
+    verifier: str = "rootsift"
 
     def probability(self, evidence: Evidence) -> float:
         model = self.patches if evidence.local_inliers < 0 else self.verified
         return model.probability(evidence)
 
     def suits(self, config: Config) -> bool:
-        """Whether it was fitted with the geometry and scorer of a completed Config."""
-        size = (config.image_width, config.image_height)
-        return (self.scorer, self.patch_sizes, self.image_size) == (config.scorer, config.patch_sizes, size)
+        """Whether it was fitted with the settings of a completed Config that shape the evidence."""
+        own = _evidence_settings(config)
+        strides = self.patch_strides or (1,) * len(self.patch_sizes)
+        fitted = replace(self, patch_strides=strides, patch_weights=self.patch_weights or own["patch_weights"])
+        return all(getattr(fitted, name) == value for name, value in own.items())
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -90,7 +97,7 @@ class Calibration:
     def from_json(cls, given: dict[str, Any]) -> "Calibration":
         """Raises ModelError for anything but what `to_json` writes."""
         try:
-            models = {}
+            models: dict[str, Any] = {}
             for name, features in _FEATURES.items():
                 weights = {str(k): float(v) for k, v in given[name]["weights"].items()}
                 bias = float(given[name]["bias"])
@@ -101,8 +108,10 @@ class Calibration:
                 models[name] = Logistic(bias, weights)
             width, height = given["image_size"]
             sizes = tuple(int(size) for size in given["patch_sizes"])
+            later = {name: given[name] for name in ("scale_weight", "verifier") if name in given}
+            later |= {name: tuple(given.get(name, ())) for name in ("patch_strides", "patch_weights")}
             return cls(**models, scorer=given["scorer"], patch_sizes=sizes, image_size=(int(width), int(height)),
-                       source=str(given["source"]))  # fmt: skip
+                       source=str(given["source"]), **later)  # fmt: skip
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ModelError(f"calibration is incomplete or malformed ({error!r}); refit: pnv calibrate") from None
 
@@ -151,8 +160,12 @@ def fit_calibration(
             continue
         table = np.array([[f(e) for f in features.values()] for (e, _), u in zip(examples, use, strict=True) if u])
         models[name] = _fit_logistic(table, truth[use], weights[use], list(features))
-    size = (config.image_width, config.image_height)
-    return Calibration(models["patches"], models["verified"], config.scorer, config.patch_sizes, size, source)
+    return Calibration(models["patches"], models["verified"], source=source, **_evidence_settings(config))
+
+
+def _evidence_settings(config: Config) -> dict[str, Any]:
+    names = ("scorer", "patch_sizes", "patch_strides", "patch_weights", "scale_weight", "verifier")
+    return {name: getattr(config, name) for name in names} | {"image_size": (config.image_width, config.image_height)}
 
 
 def _fit_logistic(

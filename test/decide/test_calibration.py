@@ -1,6 +1,7 @@
 """The score as a probability: fitting, judging by hand-computed figures, and living in a model file."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -133,6 +134,21 @@ def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
     assert calibration_for(stored, CONFIG.replace(scorer="rapid")) is CONSERVATIVE
     assert calibration_for(stored, CONFIG.replace(image_width=640)) is CONSERVATIVE
     assert calibration_for(None, CONFIG) is CONSERVATIVE
+
+
+def test_a_calibration_holds_for_the_settings_that_shape_the_evidence_it_was_fitted_on():
+    examples = [(e, label) for e, label, _ in drawn(np.random.default_rng(0), 200)]
+    stored = fit_calibration(examples, np.ones(200), CONFIG, "").to_json()
+    assert calibration_for(json.loads(json.dumps(stored)), CONFIG) is not CONSERVATIVE
+    for change in (
+        {"patch_strides": (1, 2)},
+        {"patch_weights": (0.9, 0.1)},
+        {"scale_weight": 0.0},
+        {"verifier": "another"},
+    ):
+        assert calibration_for(stored, CONFIG.replace(**change)) is CONSERVATIVE, change
+    for change in ({"accept_score": 0.9}, {"threads": 1}, {"patch_precision": "int8"}, {"verify": 1}):
+        assert calibration_for(stored, CONFIG.replace(**change)) is not CONSERVATIVE, change
 
 
 @pytest.mark.parametrize(
