@@ -18,7 +18,8 @@ REQUIRED = [
     "threadpoolctl>=3",
     "tqdm>=4.60",
     "msgspec>=0.18",  # what files say is checked against types and bounds
-    "rosbags>=0.10",  # rosbag2 in sqlite3 and mcap without a ROS installation
+    "pyyaml>=6",  # pnv --config
+    "rosbags>=0.11",  # single .db3 and .mcap files as well; rosbag2 in sqlite3 and mcap without a ROS installation
 ]
 
 ROS = [
@@ -49,7 +50,6 @@ DEVELOPMENT = [
     "mypy==2.4.1",
     "import-linter>=2.1",  # the contract over who imports whom, in pyproject.toml
     "matplotlib>=3.8",
-    "pyyaml>=6",
     "colcon-common-extensions>=0.3",
     "empy<5",  # colcon reads package templates with empy 3 or 4
     "catkin_pkg>=1",  # colcon reads package.xml with it

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from msg_adapters.images import message_to_frame
-from pnv_cli.sources import IMAGE_TYPES
+from pnv_cli.sources import IMAGE_TYPES, open_bag
 from pnv_core.errors import PnvError
 
 _POSE_TYPES = (
@@ -38,9 +38,6 @@ def unpacked(
 
     Raises PnvError for a bag without images or poses, naming the topics it has.
     """
-    from rosbags.highlevel import AnyReader, AnyReaderError
-    from rosbags.typesys import Stores, get_typestore
-
     if not bag.exists():
         raise PnvError(f"{bag}: no such bag")
     files = sorted(p for p in (bag.rglob("*") if bag.is_dir() else [bag]) if p.is_file())
@@ -49,12 +46,7 @@ def unpacked(
     done = cache / name
     if (done / "poses.csv").is_file():
         return done
-    try:
-        reader = AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_JAZZY))
-        reader.open()
-    except (AnyReaderError, OSError, ValueError) as error:
-        raise PnvError(f"{bag}: cannot be read as a rosbag2 ({error})") from None
-    with closing(reader):
+    with closing(open_bag(bag)) as reader:
         images = _one_topic(reader.connections, IMAGE_TYPES, image_topic, bag, "image")
         poses = _one_topic(reader.connections, _POSE_TYPES, pose_topic, bag, "pose")
         times, values = [], []

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from pnv_cli.common import add_config_flags, config_from
+from pnv_cli.progress import bar
 from pnv_core.config import Config
 from pnv_core.errors import ConfigError
 
@@ -50,7 +50,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="spent on each measurement (default 2)")
     parser.add_argument("--images", metavar="DIR", help="measure with these images; by default rendered ones")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of a table")
-    add_config_flags(parser)
+    add_config_flags(parser, sections=("Describing", "Re-ranking"))
     parser.set_defaults(run=run)
 
 
@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     config = config_from(args)
     images = _images(args.images)
     measured: list[Measured] = []
-    for width, height in tqdm(_sizes(config), desc="timing", unit="size", leave=False):
+    for width, height in bar(_sizes(config), desc="timing", unit="size", leave=False):
         measured += _measure(config.replace(image_width=width, image_height=height), images, args.seconds)
     best = proposal(measured, args.rate)
     if args.json:

@@ -4,18 +4,7 @@ import argparse
 
 from pnv_cli.common import add_config_flags, config_from, writable
 from pnv_cli.sources import add_source_flags, source_of
-from pnv_core.describe.describer import describer_from
-from pnv_core.describe.model_files import save_model
 from pnv_core.errors import ConfigError, PnvError
-from pnv_lab.calibrating import (
-    calibrated,
-    cross_checked,
-    gathered,
-    truth_of_matches,
-    truth_of_poses,
-    truth_of_time,
-    without_unlabelled_loops,
-)
 
 _LEAST = 30  # examples of either kind below which a fit says little
 
@@ -31,7 +20,11 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     )
     add_source_flags(parser)
     truth = parser.add_mutually_exclusive_group()
-    truth.add_argument("--poses", metavar="CSV", help="columns frame,x,y and, if known, z, yaw (radians)")
+    truth.add_argument(
+        "--poses",
+        metavar="FILE",
+        help="csv (frame or timestamp, x, y and, if known, z, yaw or qx,qy,qz,qw), TUM, EuRoC",
+    )
     truth.add_argument("--matches", metavar="CSV", help="columns query,true_refs; references separated by ;")
     parser.add_argument("--radius-m", type=float, default=2.0, help="with --poses: one place within; default 2")
     parser.add_argument("--heading-deg", type=float, default=30.0, help="with --poses: one view within; default 30")
@@ -39,11 +32,23 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     parser.add_argument("--far-s", type=float, default=30.0, help="from time: another place beyond; default 30")
     parser.add_argument("--precision", type=float, default=0.99, help="wished share of true closures; default 0.99")
     parser.add_argument("-o", "--output", required=True, metavar="MODEL", help="the calibrated model")
-    add_config_flags(parser)
+    add_config_flags(parser, sections=("Describing", "Keyframes", "Retrieval", "Re-ranking"))
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    from pnv_core.describe.describer import describer_from
+    from pnv_core.describe.model_files import save_model
+    from pnv_lab.calibrating import (
+        calibrated,
+        cross_checked,
+        gathered,
+        truth_of_matches,
+        truth_of_poses,
+        truth_of_time,
+        without_unlabelled_loops,
+    )
+
     output = writable(args.output)
     if not 0 < args.near_s < args.far_s:
         raise ConfigError(f"--near-s {args.near_s} --far-s {args.far_s}; allowed: 0 < near < far")

@@ -3,25 +3,26 @@
 import argparse
 from typing import Any
 
-import numpy as np
-
 from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_core.describe.describer import describer_from
-from pnv_core.files import atomic_write
-from pnv_core.images import read_image
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    parser = subparsers.add_parser("describe", help="the descriptors of an image, as arrays", allow_abbrev=False)
+    parser = subparsers.add_parser("describe", description="Writes the descriptors of an image as arrays.")
     parser.add_argument("image")
     parser.add_argument(
         "-o", "--output", required=True, metavar="OUT.npz", help="global (D,), patches_P (n, D), grid_P (rows, cols)"
     )
-    add_config_flags(parser)
+    add_config_flags(parser, sections=("Describing",))
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
+    import numpy as np
+
+    from pnv_core.describe.describer import describer_from
+    from pnv_core.files import atomic_write
+    from pnv_core.images import read_image
+
     output = writable(args.output)
     config = config_from(args)
     image = read_image(args.image)

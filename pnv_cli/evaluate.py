@@ -2,8 +2,6 @@
 
 import argparse
 import json
-import platform
-import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -45,7 +43,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--out", metavar="DIR", help=f"write {', '.join(_FORMATS)}, report.html and submissions here")
     parser.add_argument("--report", metavar="FILE.html", help="write the report here")
     add_extraction_flags(parser)
-    add_config_flags(parser)
+    add_config_flags(parser, sections=("Describing", "Retrieval", "Re-ranking"))
     parser.set_defaults(run=run)
 
 
@@ -189,29 +187,10 @@ def _write_report(
     figures: Sequence[Sequence["Figures"]],
     args: argparse.Namespace,
 ) -> None:
+    from pnv_lab.evaluation.machine import about
     from pnv_lab.evaluation.report import Chapter, evaluation_report
 
     chapters = [Chapter(r, f) for r, f in zip(results, figures, strict=True)]
-    words = ["pnv", "evaluate", "--dataset", args.dataset, "--method", args.method]
-    words += ["--queries", str(args.queries)] if args.queries else []
-    words += ["--root", *(Path(r).name for r in args.root)]
-    done = evaluation.completed(evaluation.config)
-    model = f"{done.weights}, {done.image_width}x{done.image_height}, patch sizes {done.patch_sizes}"
-    about = [("Command", shlex.join(words)), ("Model", model), ("Machine", machine())]
+    head = about(args.command_line, evaluation.config, evaluation.completed(evaluation.config))
     with atomic_write(target) as file:
-        file.write(evaluation_report(evaluation, chapters, about).encode())
-
-
-def machine() -> str:
-    """The processor and how many cores this process may use."""
-    import os
-
-    name = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                name = line.partition(":")[2].strip()
-                break
-    except OSError:
-        pass
-    return f"{len(os.sched_getaffinity(0))} cores of {name}"
+        file.write(evaluation_report(evaluation, chapters, head).encode())

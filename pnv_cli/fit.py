@@ -4,23 +4,22 @@ import argparse
 import random
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
-
-import torch
-from tqdm import tqdm
+from typing import TYPE_CHECKING, Any
 
 from pnv_cli.common import writable
-from pnv_core.describe.download import resolve_weights
-from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
-from pnv_core.describe.trunks import TRUNKS
+from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
-from pnv_lab.fit import FitOptions, adapt_model, fit_model, image_files
+
+if TYPE_CHECKING:
+    from pnv_core.describe.model_files import Model
+    from pnv_lab.fit import FitOptions
 
 _UNTRAINED = ("rootsift",)  # trunks that need no weights
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = subparsers.add_parser("fit", help="adapt vocabulary and projections to your own images, without training")
+    what = "Adapts the vocabulary and projections of a model to your own images, without training."
+    parser = subparsers.add_parser("fit", help=what, description=what)
     parser.add_argument(
         "--images", nargs="+", required=True, metavar="DIR", help="folders of images of your environment"
     )
@@ -53,6 +52,13 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def run(args: argparse.Namespace) -> int:
+    import torch
+
+    from pnv_core.describe.download import resolve_weights
+    from pnv_core.describe.model_files import ModelInfo, load_model, save_model
+    from pnv_core.describe.trunks import TRUNKS
+    from pnv_lab.fit import adapt_model, fit_model, image_files
+
     output = writable(args.output)
     torch.set_num_threads(max(args.threads, 1))
     if args.device == "cuda" and not torch.cuda.is_available():
@@ -86,8 +92,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _options(args: argparse.Namespace, base: Model | None) -> FitOptions:
+def _options(args: argparse.Namespace, base: "Model | None") -> "FitOptions":
     """The base model's sizes unless given."""
+    from pnv_lab.fit import FitOptions
+
     plain = FitOptions(patch_dim=64)
     given: dict[str, Any] = {
         "clusters": args.clusters or (base.netvlad.clusters if base else plain.clusters),
@@ -106,7 +114,7 @@ def _options(args: argparse.Namespace, base: Model | None) -> FitOptions:
     return FitOptions(**given, whiten=not args.no_whiten, seed=args.seed)
 
 
-def _report(args: argparse.Namespace, base: Model | None, output: Path) -> None:
+def _report(args: argparse.Namespace, base: "Model | None", output: Path) -> None:
     """Recall with the model the fit began from and with the fitted one."""
     from pnv_cli.recall import progress
     from pnv_core.config import Config
@@ -127,4 +135,4 @@ def _report(args: argparse.Namespace, base: Model | None, output: Path) -> None:
 
 
 def _bar(items: Iterable[Path], what: str) -> Iterable[Path]:
-    return tqdm(items, desc=what, unit="image")
+    return bar(items, desc=what, unit="image")

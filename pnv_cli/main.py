@@ -1,38 +1,70 @@
 """`pnv`: the command line of the recogniser."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from pnv_cli.common import CommandParser, hint
 from pnv_core.errors import PnvError
 
-COMMANDS = (
-    "describe",
-    "match",
-    "run",
-    "recall",
-    "evaluate",
-    "calibrate",
-    "fit",
-    "train",
-    "weights",
-    "map",
-    "doctor",
-    "bench",
-)
+COMMANDS = {
+    "run": "loop closures of a folder of images, a video or a bag, with a report",
+    "match": "do two images show the same place?",
+    "map": "inspect, check, merge, thin out, recover and export saved maps",
+    "doctor": "check this machine, and say what to do",
+    "bench": "how fast this machine is, and which settings keep up with a rate",
+    "weights": "published models: list, fetch, verify",
+    "describe": "the descriptors of an image, as arrays",
+    "recall": "recall@1, 5 and 10 over two folders of images",
+    "evaluate": "recall, precision and cost of many methods over data sets, with a report",
+    "calibrate": "fit the score to your own sequence",
+    "fit": "adapt vocabulary and projections to your own images",
+    "train": "train a model",
+}  # a command's module, which may take long to import, is loaded when the command is given
+
+
+def help_text() -> str:
+    """What `pnv --help` prints, without loading any command."""
+    lines = [f"  {name:<10}{what}" for name, what in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: pnv COMMAND ...   (pnv COMMAND --help says more)\n",
+            "Visual place recognition and loop closure. First: pnv run PATH\n",
+            *lines,
+            "\n  --help    this list\n  --version",
+        ]
+    )
+
+
+def command_parser(name: str) -> CommandParser:
+    """The parser of one command. Imports its module."""
+    subparsers = argparse.ArgumentParser(prog="pnv").add_subparsers(parser_class=CommandParser)
+    import_module(f"pnv_cli.{name}").add_parser(subparsers)
+    parser = subparsers.choices[name]
+    assert isinstance(parser, CommandParser)
+    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand. 0 done, 2 unusable input with one line on stderr, 130 interrupted."""
-    parser = argparse.ArgumentParser(
-        prog="pnv", description="Visual place recognition with Patch-NetVLAD.", allow_abbrev=False
-    )
-    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     given = list(sys.argv[1:] if argv is None else argv)
-    for name in COMMANDS if not given or given[0] not in COMMANDS else given[:1]:  # importing torch takes seconds
-        import_module(f"pnv_cli.{name}").add_parser(subparsers)
-    args = parser.parse_args(argv)
+    if not given or given[0] in ("-h", "--help", "help"):
+        print(help_text(), file=sys.stdout if given else sys.stderr)
+        return 0 if given else 2
+    if given[0] == "--version":
+        import pnv_core
+
+        print(f"pnv {pnv_core.__version__}")
+        return 0
+    if given[0] not in COMMANDS:
+        allowed = hint(given[0], COMMANDS) or f"; allowed: {', '.join(COMMANDS)}"
+        print(f"pnv: no command {given[0]!r}{allowed}", file=sys.stderr)
+        return 2
+    parser = command_parser(given[0])
+    args = parser.parse_command(given[1:])
+    args.command_line = shlex.join(["pnv", *given])  # reports say how to repeat them
     try:
         return int(args.run(args))
     except PnvError as error:

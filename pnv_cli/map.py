@@ -6,15 +6,17 @@ from collections.abc import Callable
 from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pnv_cli.common import writable
 from pnv_core.errors import ConfigError
-from pnv_core.maps import tools
-from pnv_core.maps.manifest import Manifest, read_manifest
+
+if TYPE_CHECKING:
+    from pnv_core.maps.manifest import Manifest
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = subparsers.add_parser("map", help="inspect, check, merge, thin out, recover and export saved maps")
+    parser = subparsers.add_parser("map", description="Inspects, checks, merges, thins out, recovers and exports maps.")
     actions = parser.add_subparsers(required=True, metavar="ACTION")
 
     info = _action(actions, "info", _info, "what a map holds, by its manifest")
@@ -63,6 +65,8 @@ def _output(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def _info(args: argparse.Namespace) -> int:
+    from pnv_core.maps.manifest import read_manifest
+
     manifest = read_manifest(args.map)
     size = sum(segment.bytes for segment in manifest.segments)
     if args.json:
@@ -89,16 +93,22 @@ def _utc(stamp_ns: int) -> str:
 
 
 def _verify(args: argparse.Namespace) -> int:
+    from pnv_core.maps import tools
+
     manifest = tools.verify(args.map)
     print(f"{args.map}: whole, {manifest.keyframes} keyframes in {len(manifest.sessions)} sessions")
     return 0
 
 
 def _merge(args: argparse.Namespace) -> int:
+    from pnv_core.maps import tools
+
     return _written(args.output, tools.merge(args.first, args.second, args.output))
 
 
 def _export(args: argparse.Namespace) -> int:
+    from pnv_core.maps import tools
+
     output = writable(args.output)
     if output.suffix == ".csv" and not args.patches:
         rows = tools.export_csv(args.map, output)
@@ -111,6 +121,8 @@ def _export(args: argparse.Namespace) -> int:
 
 
 def _prune(args: argparse.Namespace) -> int:
+    from pnv_core.maps import tools
+
     if args.keep is None and args.budget_mb is None and not args.drop_session:
         raise ConfigError("nothing to prune by; allowed: --keep, --budget-mb or --drop-session")
     for name, value in (("--keep", args.keep), ("--budget-mb", args.budget_mb)):
@@ -128,6 +140,8 @@ def _prune(args: argparse.Namespace) -> int:
 
 
 def _recover(args: argparse.Namespace) -> int:
+    from pnv_core.maps import tools
+
     recovery = tools.recover(args.map, args.output)
     for problem in recovery.problems:
         print(problem)
@@ -136,6 +150,6 @@ def _recover(args: argparse.Namespace) -> int:
     return 0
 
 
-def _written(output: Path, manifest: Manifest) -> int:
+def _written(output: Path, manifest: "Manifest") -> int:
     print(f"{output}: {manifest.keyframes} keyframes in {len(manifest.sessions)} sessions")
     return 0

@@ -7,9 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from pnv_cli.common import add_config_flags, config_from
+from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
 
 RECALLS = (1, 5, 10)
@@ -26,7 +25,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--references", required=True, metavar="DIR", help="images to find")
     parser.add_argument("--matches", required=True, metavar="CSV", help="query,true_refs; references separated by ;")
     add_extraction_flags(parser)
-    add_config_flags(parser)
+    add_config_flags(parser, sections=("Describing", "Retrieval", "Re-ranking"))
     parser.set_defaults(run=run)
 
 
@@ -60,7 +59,7 @@ def checked_extraction(args: argparse.Namespace) -> Path:
 
 def progress(items: Iterable[Any], count: int, what: str) -> Iterable[Any]:
     """The items with a bar on stderr that says how much time is left."""
-    return tqdm(items, total=count, desc=what, unit="", file=sys.stderr, mininterval=0.5, leave=False)
+    return bar(items, total=count, desc=what, unit="item")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,28 +1,25 @@
-"""pnv run --images DIR | --video FILE | --bag DIR  --csv OUT.csv [--all]"""
+"""pnv run PATH: the loop closures of a folder of images, a video or a bag."""
 
 import argparse
 import csv
 import io
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
-from pnv_cli.common import add_config_flags, config_from, writable
-from pnv_cli.sources import add_source_flags, source_of
-from pnv_core.decide.calibration import CONSERVATIVE
-from pnv_core.describe.describer import describer_from
+from pnv_cli.common import ALWAYS_SHOWN, add_config_flags, config_from, writable
+from pnv_cli.sources import add_source_flags, named_source, source_of
 from pnv_core.errors import ConfigError, PnvError
-from pnv_core.files import atomic_write
-from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.timing import StageTimer
-from pnv_core.types import LoopClosure
 
 if TYPE_CHECKING:
+    from pnv_core.recognizer import PlaceRecognizer
+    from pnv_core.types import ImageRef, LoopClosure
     from pnv_lab.evaluation.run_report import RunRecorder
+    from pnv_lab.poses import Poses
 
 COLUMNS = (
     "query",
@@ -36,87 +33,277 @@ COLUMNS = (
     "accepted",
     "reason",
 )
-
-Names = dict[tuple[str, int], str]  # of a frame, by camera and stamp
+_SHOWN = (*ALWAYS_SHOWN, "accept_score", "exclude_recent_s", "min_interval_s", "candidates")
 
 
 def add_parser(subparsers: argparse._SubParsersAction) -> None:
-    parser = subparsers.add_parser("run", help="loop closures of a sequence", allow_abbrev=False)
+    parser = subparsers.add_parser(
+        "run",
+        description="Finds the loop closures of a folder of images, a video or a bag. Without --csv or --out, "
+        "closures.csv and report.html go to out/NAME-DATE/.",
+    )
     add_source_flags(parser)
-    parser.add_argument("--csv", required=True, metavar="OUT.csv", help="one row per accepted closure")
-    parser.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
-    parser.add_argument("--report", metavar="FILE.html", help="scores, pictures and path of the run as one page")
-    parser.add_argument("--poses", metavar="CSV", help="positions for the report: columns timestamp,x,y,z")
-    parser.add_argument("--timing", action="store_true", help="print the time of each stage")
-    add_config_flags(parser)
+    out = parser.add_argument_group("what is written")
+    out.add_argument("--out", metavar="DIR", help="folder for closures.csv and report.html; default out/NAME-DATE")
+    out.add_argument("--csv", metavar="OUT.csv", help="one row per accepted closure; alone: no folder, no report")
+    out.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
+    out.add_argument("--report", metavar="FILE.html", help="scores, pictures and path of the run as one page")
+    out.add_argument("--pairs", metavar="FILE", help="accepted closures as image pairs, in hloc's format")
+    out.add_argument("--g2o", metavar="FILE", help="pose graph of --poses and closures; with --intrinsics their poses")
+    out.add_argument("--tum", metavar="FILE", help="poses of the keyframes as a TUM trajectory")
+    out.add_argument("--timing", action="store_true", help="print the time of each stage")
+    given = parser.add_argument_group("what is known")
+    given.add_argument(
+        "--poses", metavar="FILE", help="true poses: csv (frame or timestamp, x, y, ...), TUM or EuRoC; for report, g2o"
+    )
+    given.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="of the camera, in pixels of its images; for --g2o")
+    maps = parser.add_argument_group("maps")
+    maps.add_argument("--save-map", nargs="?", const="", metavar="DIR", help="save the map; default in the out folder")
+    maps.add_argument("--load-map", metavar="DIR", help="begin with this map: places of an earlier run are found again")
+    maps.add_argument("--localize", action="store_true", help="with --load-map: find its places, add nothing")
+    add_config_flags(parser, shown=_SHOWN)
     parser.set_defaults(run=run)
 
 
+@dataclass(frozen=True)
+class Targets:
+    """Where everything is written; None: it is not."""
+
+    folder: Path | None
+    csv: Path | None
+    report: Path | None
+    pairs: Path | None
+    g2o: Path | None
+    tum: Path | None
+    map: Path | None
+
+
 def run(args: argparse.Namespace) -> int:
-    output = writable(args.csv)
-    report = writable(args.report) if args.report else None
-    if args.poses and not report:
-        raise ConfigError("--poses is shown in the report; allowed: together with --report FILE.html")
+    from pnv_cli.progress import bar
+    from pnv_cli.tally import Tally
+    from pnv_core.decide.calibration import CONSERVATIVE
+
+    targets, poses = _targets(args), _poses(args)
     config = config_from(args)
     source = source_of(args)
-    timer = StageTimer(time.perf_counter)
-    recognizer = PlaceRecognizer(describer_from(config), timer=timer)
+    recognizer = _recognizer(args, config)
     if recognizer.judge.calibration is CONSERVATIVE:
         print("pnv: no calibration fits this model and these settings: a conservative score decides", file=sys.stderr)
-    recorder = _recorder(recognizer) if report else None
-    names: Names = {}
-    rows: list[dict] = []
-    done = 0
+    recorder = _recorder(recognizer) if targets.report else None
+    tally, names = Tally(), Names(recognizer.database.session)
+    loaded, started = len(recognizer.database), time.perf_counter()
+    rows: list[dict[str, Any]] = []
+    accepted: list[LoopClosure] = []
+    if targets.folder:
+        targets.folder.mkdir(parents=True, exist_ok=True)
     try:
-        for name, frame in tqdm(
-            source.frames, total=source.count or None, unit="frame", disable=not sys.stderr.isatty()
-        ):
-            names[frame.camera, frame.stamp_ns] = name
+        for name, frame in bar(source.frames, total=source.count or None, unit="frame"):
+            width = frame.rgb.shape[1]
+            names.add(name, frame.camera, frame.stamp_ns)
             closures = recognizer.process(frame)
+            tally.add(frame, closures)
+            accepted += [c for c in closures if c.accepted]
             rows += [_row(c, names) for c in _reported(closures, args.all)]
             if recorder:
                 recorder.add(name, frame, closures)
-            done += 1
     finally:  # an interrupted run keeps what it found
-        _write(output, rows)
-    if not done:
+        if targets.csv:
+            _write_csv(targets.csv, rows)
+    if not tally.frames:
         raise PnvError("no frame of the input could be read")
-    if recorder and report:
-        _write_report(report, recorder, args, names)
-    accepted = sum(row["accepted"] for row in rows)
-    print(f"{done} frames, {len(recognizer.database)} keyframes, {accepted} closures -> {output}")
+    seconds = time.perf_counter() - started
+    counts = tally.sentence(len(recognizer.database) - loaded)
+    print(counts + (f" -> {targets.csv}" if args.csv else ""))
+    rate = f"{tally.frames / seconds:.1f} frames/s"
+    stages = ", ".join(f"{stage} {median:.1f}" for stage, (median, _, _) in recognizer.timer.summary_ms().items())
+    facts = [("refused", f"{tally.refusals()}   (candidates)"), ("time", f"{stages} ms (medians); {rate}")]
+    if not tally.closures:
+        facts.insert(0, ("nothing", tally.why_nothing(recognizer.config)))
+    for title, words in facts:
+        print(f"  {title:<9}{words}")
     if args.timing:
-        for stage, (median, late, latest) in timer.summary_ms().items():
+        for stage, (median, late, latest) in recognizer.timer.summary_ms().items():
             print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms   99 % {latest:7.1f} ms")
+    if recorder and targets.report:
+        _write_report(targets.report, recorder, args, recognizer, [("Counts", counts), *facts], poses)
+    _export(targets, recognizer, accepted, names, poses, _cameras(args, accepted, width))
+    _save_map(targets, recognizer)
+    written = [str(path) for path in (targets.csv, targets.report, targets.pairs, targets.g2o, targets.tum, targets.map)
+               if path]  # fmt: skip
+    print(f"  {'written':<9}{', '.join(written)}")
     return 0
 
 
-def _recorder(recognizer: PlaceRecognizer) -> "RunRecorder":
+class Names:
+    """What the frames of this run are called; those of a loaded map have their stamps only."""
+
+    def __init__(self, session: int) -> None:
+        self._session = session
+        self._known: dict[tuple[str, int], str] = {}
+
+    def add(self, name: str, camera: str, stamp_ns: int) -> None:
+        self._known[camera, stamp_ns] = name
+
+    def frames(self) -> list[tuple[str, int]]:
+        """(name, stamp) of every frame."""
+        return [(name, stamp) for (_, stamp), name in self._known.items()]
+
+    def of(self, ref: "ImageRef") -> str:
+        if ref.session == self._session:
+            return self._known[ref.camera, ref.stamp_ns]
+        return f"map:{ref.session}:{_seconds(ref.stamp_ns)}"
+
+
+def _targets(args: argparse.Namespace) -> Targets:
+    """Where the flags want what. Raises ConfigError for a place that cannot be written, before any work."""
+    alone = [args.csv, args.report, args.pairs, args.g2o, args.tum]
+    folder = Path(args.out) if args.out else None
+    if folder is None and not any(alone):
+        stem = Path(named_source(args)[1]).resolve()
+        name = f"{stem.parent.name}-{stem.name}" if stem.name == "images" else stem.stem
+        folder = Path("out") / f"{name}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    if folder and folder.exists() and not folder.is_dir():
+        raise ConfigError(f"--out {folder}: is a file; allowed: a folder")
+    if (args.g2o or args.tum) and not args.poses:
+        raise ConfigError("--g2o and --tum write poses; allowed: together with --poses FILE")
+    if args.poses and not (folder or args.report or args.g2o or args.tum):
+        raise ConfigError("--poses is shown in the report; allowed: together with --report FILE.html, --g2o or --tum")
+    if args.localize and not args.load_map:
+        raise ConfigError("--localize finds the places of a map; allowed: together with --load-map DIR")
+    if args.save_map == "" and folder is None:
+        raise ConfigError("--save-map needs a folder; allowed: --save-map DIR, or together with --out DIR")
+    named = {
+        name: writable(value) for name in ("csv", "report", "pairs", "g2o", "tum") if (value := getattr(args, name))
+    }
+    if folder:
+        named = {"csv": folder / "closures.csv", "report": folder / "report.html"} | named
+        (folder.parent).mkdir(parents=True, exist_ok=True)
+        writable(folder.parent / "x" if not folder.exists() else folder / "x")
+    saved = None if args.save_map is None else Path(args.save_map) if args.save_map else Path(folder or "") / "map"
+    return Targets(folder, map=saved, **{n: named.get(n) for n in ("csv", "report", "pairs", "g2o", "tum")})
+
+
+def _recognizer(args: argparse.Namespace, config: Any) -> "PlaceRecognizer":
+    from pnv_core.database import KeyframeDatabase
+    from pnv_core.describe.describer import describer_from
+    from pnv_core.maps import MapStore
+    from pnv_core.recognizer import PlaceRecognizer
+    from pnv_core.timing import StageTimer
+
+    describer = describer_from(config)
+    database = KeyframeDatabase.for_describer(describer, read_only=args.localize)
+    if args.load_map:
+        MapStore(args.load_map, describer.map_fingerprint).load(database)
+        print(f"{args.load_map}: {len(database)} keyframes loaded")
+    return PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
+
+
+def _save_map(targets: Targets, recognizer: "PlaceRecognizer") -> None:
+    from pnv_core.maps import MapStore
+
+    if targets.map:
+        store = MapStore(targets.map, recognizer.describer.map_fingerprint)
+        print(f"  {'map':<9}{store.save(recognizer.database.snapshot())}")
+
+
+def _poses(args: argparse.Namespace) -> "Poses | None":
+    if not args.poses:
+        return None
+    from pnv_lab.poses import read_poses
+
+    poses = read_poses(args.poses)
+    if (args.g2o or args.tum) and poses.quaternions is None:
+        raise ConfigError(f"{args.poses}: has no orientations; allowed for --g2o and --tum: yaw, or qx, qy, qz, qw")
+    return poses
+
+
+def _recorder(recognizer: "PlaceRecognizer") -> "RunRecorder":
     from pnv_lab.evaluation.run_report import RunRecorder
 
-    return RunRecorder(recognizer.describer.image_size)
+    def kept_picture(ref: "ImageRef") -> bytes:
+        return recognizer.database.descriptor(ref.id).thumbnail if ref.id in recognizer.database else b""
+
+    return RunRecorder(recognizer.describer.image_size, recognizer.database.session, kept_picture)
 
 
-def _write_report(target: Path, recorder: "RunRecorder", args: argparse.Namespace, names: Names) -> None:
-    from pnv_lab.evaluation.run_report import read_positions
+def _write_report(
+    target: Path,
+    recorder: "RunRecorder",
+    args: argparse.Namespace,
+    recognizer: "PlaceRecognizer",
+    facts: Sequence[tuple[str, str]],
+    poses: "Poses | None",
+) -> None:
+    from pnv_core.files import atomic_write
+    from pnv_lab.evaluation.machine import about
 
-    positions = read_positions(Path(args.poses), [stamp for _, stamp in names]) if args.poses else None
-    taken = Path(args.images or args.video or args.bag).name
+    head = about(args.command_line, config_from(args), recognizer.describer.config)
+    head.insert(1, ("Input", str(Path(named_source(args)[1]).resolve())))
+    page = recorder.html([*head, *((title.capitalize(), words) for title, words in facts)], poses)
     with atomic_write(target) as file:
-        file.write(recorder.html([("Input", taken)], positions).encode())
+        file.write(page.encode())
     recorder.close()
-    print(f"report: {target}")
 
 
-def _reported(closures: list[LoopClosure], best_of_every_query: bool) -> Iterator[LoopClosure]:
+def _cameras(args: argparse.Namespace, accepted: Sequence["LoopClosure"], width: int) -> dict[str, Any]:
+    """--intrinsics for every camera that closed a loop; none without the flag."""
+    if not args.intrinsics:
+        return {}
+    from pnv_core.pose.geometry import Intrinsics
+
+    try:
+        fx, fy, cx, cy = (float(text) for text in args.intrinsics.split(","))
+    except ValueError:
+        raise ConfigError(f"--intrinsics {args.intrinsics!r}; allowed: FX,FY,CX,CY in pixels") from None
+    return dict.fromkeys({c.query.camera for c in accepted}, Intrinsics.of_pixels(fx, fy, cx, cy, width))
+
+
+def _export(
+    targets: Targets,
+    recognizer: "PlaceRecognizer",
+    accepted: Sequence["LoopClosure"],
+    names: Names,
+    poses: "Poses | None",
+    cameras: dict[str, Any],
+) -> None:
+    """The accepted closures, and the poses of the keyframes, for other programs."""
+    from pnv_core.files import atomic_write
+    from pnv_core.pose.export import GraphPose, graph_to_g2o, pairs_to_hloc, poses_to_tum
+    from pnv_core.pose.relative_poses import RelativePoses
+
+    texts: dict[Path, str] = {}
+    if targets.pairs:
+        texts[targets.pairs] = pairs_to_hloc([(names.of(c.query), names.of(c.match)) for c in accepted])
+    if poses is not None and poses.quaternions is not None and (targets.tum or targets.g2o):
+        rows = poses.of_frames(names.frames())
+        nodes = {
+            ref: GraphPose(poses.positions[row], poses.quaternions[row])
+            for ref in recognizer.database.refs()
+            if ref.session == recognizer.database.session
+            and (row := rows.get((names.of(ref), ref.stamp_ns))) is not None
+        }
+        if targets.tum:
+            texts[targets.tum] = poses_to_tum({ref.stamp_ns: pose for ref, pose in nodes.items()})
+        if targets.g2o:
+            for ref, pose in sorted(nodes.items(), key=lambda node: node[0].stamp_ns):
+                recognizer.odometry.add(ref.stamp_ns, *map(float, pose.position))  # the run decided without it
+            measured = RelativePoses(recognizer, cameras)
+            closures = [(c, measured.of(c)) for c in accepted]
+            texts[targets.g2o] = graph_to_g2o({ref.id: pose for ref, pose in nodes.items()}, closures)
+    for path, text in texts.items():
+        with atomic_write(path) as file:
+            file.write(text.encode())
+
+
+def _reported(closures: "list[LoopClosure]", best_of_every_query: bool) -> "Iterator[LoopClosure]":
     accepted = [c for c in closures if c.accepted]
     yield from accepted or (closures[:1] if best_of_every_query else [])
 
 
-def _row(closure: LoopClosure, names: Names) -> dict:
+def _row(closure: "LoopClosure", names: Names) -> dict[str, Any]:
     return {
-        "query": names[closure.query.camera, closure.query.stamp_ns],
-        "match": names[closure.match.camera, closure.match.stamp_ns],
+        "query": names.of(closure.query),
+        "match": names.of(closure.match),
         "query_stamp": _seconds(closure.query.stamp_ns),
         "match_stamp": _seconds(closure.match.stamp_ns),
         "score": f"{closure.score:.6f}",
@@ -132,7 +319,9 @@ def _seconds(stamp_ns: int) -> str:
     return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
 
 
-def _write(path, rows: list[dict]) -> None:
+def _write_csv(path: Path, rows: list[dict[str, Any]]) -> None:
+    from pnv_core.files import atomic_write
+
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, lineterminator="\n")
     writer.writeheader()

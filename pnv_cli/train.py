@@ -7,16 +7,14 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-import cv2
-import torch
-from tqdm import tqdm
-
 from pnv_cli.common import writable
+from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    parser = subparsers.add_parser("train", help="train a model for places (hours on a CPU, minutes with --pool)")
+    what = "Trains a model for places: hours on a CPU, minutes with --pool."
+    parser = subparsers.add_parser("train", help=what, description=what)
     parser.add_argument("--data", nargs="+", required=True, metavar="DIR", help="training folders, or folders of them")
     parser.add_argument("-o", "--output", required=True, metavar="FILE", help="model file to write (.safetensors)")
     parser.add_argument(
@@ -58,6 +56,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 
 def run(args: argparse.Namespace) -> int:
+    import cv2
+    import torch
+
     output = writable(args.output)
     torch.set_num_threads(max(args.threads, 1))
     cv2.setNumThreads(0)
@@ -72,6 +73,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None:
+    import torch
+
     from pnv_core.describe.model_files import ModelInfo, save_model
     from pnv_core.describe.trunks.compact import FIRES
     from pnv_lab.fit import FitOptions
@@ -92,7 +95,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     drawn = BatchOptions(places=20, views=4, neighbours=4, sizes=(view,), seed=options.seed + 7)
     rendered = PlaceBatches(trained, drawn)
     pool = FeaturePool(folder / "pool", rendered, args.pool or 20, args.places, args.views)
-    pool.build(trunk, layers, tqdm(range(pool.groups), desc="views", unit="group"))
+    pool.build(trunk, layers, bar(range(pool.groups), desc="views", unit="group"))
     info = ModelInfo(
         "compact",
         {"fires": FIRES, "neck": args.neck, "relu": True},
@@ -113,7 +116,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     batches = pool if args.pool else PlaceBatches(trained, fresh)
     settings = {"places": args.places, "views": args.views, "pool": args.pool, "fit": asdict(fit)}
     trainer = Trainer(model, batches, _validation(held), options, folder, args.device, settings)
-    model = trainer.run(lambda items, done, total: tqdm(items, desc="training", initial=done, total=total, unit="step"))
+    model = trainer.run(lambda items, done, total: bar(items, desc="training", initial=done, total=total, unit="step"))
     save_model(model, output, torch.float16)
     _report(trainer.journal, folder, output)
 
@@ -121,6 +124,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
 def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
     """Patch-NetVLAD's own training; the projection is fitted afterwards, as the authors do."""
     import numpy as np
+    import torch
 
     from pnv_core.describe.model_files import Model, ModelInfo, save_model
     from pnv_lab.fit import FitOptions, as_batch, projections_of, vocabulary_of
@@ -146,7 +150,7 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
 
     def maps(what: str) -> Iterator[torch.Tensor]:
         chosen = np.random.default_rng(options.seed).permutation(len(flat))[:1000]
-        for i in tqdm(chosen, desc=what, unit="image"):
+        for i in bar(chosen, desc=what, unit="image"):
             pixels = flat_view(flat[i].rgb, size, 0.0, False, np.random.default_rng(0)).pixels
             with torch.no_grad():
                 yield trunk(as_batch([pixels], args.device)).float()
@@ -154,7 +158,7 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
     trunk.to(args.device)
     netvlad = vocabulary_of(maps("vocabulary"), fit)
     trainer = TripletTrainer(trunk, netvlad, trained, _validation(held), options, folder, args.device)
-    trainer.run(lambda items, done, total: tqdm(items, desc="training", initial=done, total=total, unit="cache"))
+    trainer.run(lambda items, done, total: bar(items, desc="training", initial=done, total=total, unit="cache"))
     whole, _ = projections_of(netvlad.cpu(), maps("projection"), fit)
     info = ModelInfo(
         "vgg16", {}, *size, provenance=f"pnv train --trunk vgg16, {options.epochs} epochs on {len(flat)} images"
@@ -175,7 +179,7 @@ def _split(folders: Iterable[str]) -> tuple[list[Any], list[Any]]:
             sets += found
         else:
             raise ConfigError(f"{folder}: no training folder; allowed: one with images/, or a folder of such folders")
-    images = [image for folder in tqdm(sets, desc="sets", unit="set") for image in load_set(folder)]
+    images = [image for folder in bar(sets, desc="sets", unit="set") for image in load_set(folder)]
     held = [image for image in images if is_held(image)]
     chosen = set(map(id, held))
     return [image for image in images if id(image) not in chosen], held

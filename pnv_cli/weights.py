@@ -1,11 +1,8 @@
 """pnv weights list | fetch NAME | verify NAME or FILE"""
 
 import argparse
-import sys
 
-from tqdm import tqdm
-
-from pnv_core.describe.describer import read_model
+from pnv_cli.progress import bar
 from pnv_core.describe.download import DEFAULT_MODEL, PUBLISHED, fetch, file_sha256, recorded_sha256, resolve_weights
 from pnv_core.errors import ModelError
 
@@ -34,11 +31,11 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _fetch(args: argparse.Namespace) -> int:
-    with tqdm(unit="B", unit_scale=True, desc=args.name, file=sys.stderr, disable=not sys.stderr.isatty()) as bar:
+    with bar(unit="B", unit_scale=True, desc=f"{args.name} ") as shown:
 
         def progress(done: int, total: int) -> None:
-            bar.total = total or None
-            bar.update(done - bar.n)
+            shown.total = total or None
+            shown.update(done - shown.n)
 
         path = fetch(args.name, progress)
     print(f"{path}: sha256 {file_sha256(path)}")
@@ -46,6 +43,8 @@ def _fetch(args: argparse.Namespace) -> int:
 
 
 def _verify(args: argparse.Namespace) -> int:
+    from pnv_core.describe.describer import read_model
+
     path = resolve_weights(args.file)
     model = read_model(path)
     digest = file_sha256(path)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import pnv_core.openmp  # noqa: F401 - before torch is loaded
 from pnv_core.config import Config
 from pnv_core.errors import PnvError
-from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, PatchGrid, PlaceDescriptor, Reason
 
 if TYPE_CHECKING:
     from pnv_core.database import KeyframeDatabase
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from pnv_core.maps import MapStore
     from pnv_core.pose.relative_poses import RelativePoses
     from pnv_core.recognizer import PlaceRecognizer
+    from pnv_core.types import Evidence, Frame, ImageRef, LoopClosure, PatchGrid, PlaceDescriptor, Reason
 
 _LATER = {
     "Describer": "pnv_core.describe.describer",
@@ -25,7 +25,9 @@ _LATER = {
     "PlaceRecognizer": "pnv_core.recognizer",
     "RelativePoses": "pnv_core.pose.relative_poses",
     "load_describer": "pnv_core.describe.describer",
-}
+} | dict.fromkeys(
+    ("Evidence", "Frame", "ImageRef", "LoopClosure", "PatchGrid", "PlaceDescriptor", "Reason"), "pnv_core.types"
+)
 
 __all__ = [
     "Config",
@@ -47,7 +49,11 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Names whose modules take long to import."""
+    """Names whose modules take long to import, and the version of what is installed."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("pnv_ros")
     if name in _LATER:
         return getattr(import_module(_LATER[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

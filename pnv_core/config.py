@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pnv_core.errors import ConfigError
-from pnv_core.settings import checked, setting, settings_of
+from pnv_core.settings import Section, checked, setting, settings_of
 
 # What a preset sets when the user does not: patch geometry, scorer, input size and the file taken when none is named.
 # performance, speed and storage are the published configurations (Patch-NetVLAD repository, configs/*.ini).
@@ -50,7 +50,7 @@ class Config:
 
     preset: str = setting("default", "set of defaults for everything below", choices=tuple(PRESETS))
 
-    # Describing
+    _describing = Section("Describing")
     weights: str = setting("default", "model: 'default' (in the package), a published name, or a file")
     device: str = setting("cpu", "where the network runs", choices=("cpu", "cuda", "auto"))
     trunk_precision: str = setting(
@@ -78,13 +78,13 @@ class Config:
         "exact", "patch aggregation: exact, or fast (products in bfloat16 where it is fast)", choices=("exact", "fast")
     )
 
-    # Keyframes
+    _keyframes = Section("Keyframes")
     min_interval_s: float = setting(0.5, "least time between keyframes", unit="s", low=0.0, high=1e6, live=True)
     min_change: float = setting(
         0.05, "least change between keyframes: 1 - cosine of the global vectors", low=0.0, high=2.0, live=True
     )
 
-    # Retrieval
+    _retrieval = Section("Retrieval")
     exclude_recent_s: float = setting(
         30.0, "keyframes younger than this are no candidates", unit="s", low=0.0, high=1e6, live=True
     )
@@ -94,7 +94,7 @@ class Config:
     )
     index: str = setting("auto", "index of the global vectors: auto, exact, pq, or a registered name")
 
-    # Re-ranking
+    _reranking = Section("Re-ranking")
     scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
     scale_weight: float = setting(
         0.3,
@@ -112,7 +112,7 @@ class Config:
         high=100,
     )
 
-    # Decision
+    _decision = Section("Decision")
     accept_score: float = setting(0.5, "least calibrated score of an accepted closure", low=0.0, high=1.0, live=True)
     min_texture: float = setting(0.05, "images with less texture than this close no loop", low=0.0, high=1.0, live=True)
     consistency: int = setting(3, "neighbouring keyframes that must agree; 0 = none", low=0, high=50, live=True)
@@ -137,7 +137,7 @@ class Config:
         1.0, "least way gone between two visits, where odometry is given", unit="m", low=0.0, live=True
     )
 
-    # Memory
+    _memory = Section("Memory")
     memory_budget_mb: float = setting(
         1024.0, "bound on descriptors, patches and index together", unit="MB", low=1.0, high=1e7
     )

@@ -109,5 +109,6 @@ def list_images(folder: Path | str) -> list[Path]:
         raise ImageError(f"{folder}: no such folder of images")
     found = sorted(p for p in place.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
     if not found:
-        raise ImageError(f"{folder}: holds no image; allowed: {', '.join(SUFFIXES)}")
+        inner = "; its folder images may be meant" if (place / "images").is_dir() else ""
+        raise ImageError(f"{folder}: holds no image{inner}; allowed: {', '.join(SUFFIXES)}")
     return found

@@ -9,6 +9,10 @@ from typing import Any
 from pnv_core.errors import ConfigError
 
 
+class Section(str):
+    """A heading in the body of a Config class: the settings after it belong to it."""
+
+
 @dataclass(frozen=True)
 class Setting:
     """The declaration of one setting, as drivers (ROS parameters, flags, tables) read it."""
@@ -23,6 +27,7 @@ class Setting:
     high: float | None = None
     choices: tuple[str, ...] = ()
     live: bool = False  # may change while running
+    section: str = ""
 
     def check(self, value: Any) -> Any:
         """The value in its declared type. Raises ConfigError naming the value and what is allowed."""
@@ -69,11 +74,16 @@ def setting(default: Any, doc: str, *, kind: type | None = None, **limits: Any) 
 
 def settings_of(config_class: type) -> dict[str, Setting]:
     """Every setting a Config class declares, in order, by name."""
-    return {
-        f.name: Setting(name=f.name, default=f.default, **f.metadata["setting"])
-        for f in dataclasses.fields(config_class)
-        if "setting" in f.metadata
-    }
+    fields = {f.name: f for f in dataclasses.fields(config_class) if "setting" in f.metadata}
+    found, section = {}, ""
+    for name, value in vars(config_class).items():
+        if isinstance(value, Section):
+            section = str(value)
+        elif name in fields:
+            found[name] = Setting(
+                name, default=fields[name].default, section=section, **fields[name].metadata["setting"]
+            )
+    return found
 
 
 def checked(config: Any) -> None:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from pnv_core.decide.calibration import Calibration, Reliability, fit_calibration, reliability, threshold_for_precision
 from pnv_core.describe.describer import Describer
-from pnv_core.errors import PnvError
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Evidence, Frame
 from pnv_lab.evaluation.datasets.tables import rows
+from pnv_lab.poses import read_poses
 
 # Is it the same place? None where that is not known. Arguments: name and stamp [ns] of query and match.
 Truth = Callable[[str, int, str, int], bool | None]
@@ -102,23 +102,15 @@ def without_unlabelled_loops(examples: Examples) -> Examples:
 
 
 def truth_of_poses(path: Path | str, radius_m: float, heading_deg: float) -> Truth:
-    """From a CSV of frame,x,y[,z][,yaw]: within the radius and heading is one place, beyond twice either another."""
-    table = rows(Path(path), ("frame", "x", "y"))
-    try:
-        poses = {r["frame"]: [float(r[k]) for k in ("x", "y", "z", "yaw") if k in r] for r in table}
-    except (ValueError, TypeError) as error:
-        raise PnvError(f"{path}: {error}; allowed: numbers in x, y, z, yaw") from None
-    axes = 3 if table and "z" in table[0] else 2
-    turns = bool(table) and "yaw" in table[0]
+    """From --poses: within the radius and heading is one place, beyond twice either another."""
+    poses = read_poses(path)
 
     def truth(query: str, query_ns: int, match: str, match_ns: int) -> bool | None:
-        if query not in poses or match not in poses:
+        a, b = poses.row(query, query_ns), poses.row(match, match_ns)
+        if a is None or b is None:
             return None
-        a, b = np.array(poses[query]), np.array(poses[match])
-        far = float(np.linalg.norm(a[:axes] - b[:axes])) / radius_m
-        if turns:
-            turn = abs((a[axes] - b[axes] + np.pi) % (2 * np.pi) - np.pi)
-            far = max(far, float(np.degrees(turn)) / heading_deg)
+        far = float(np.linalg.norm(poses.positions[a] - poses.positions[b])) / radius_m
+        far = max(far, poses.turn_deg(a, b) / heading_deg)
         return True if far <= 1 else False if far >= 2 else None
 
     return truth

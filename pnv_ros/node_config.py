@@ -8,14 +8,14 @@ from rclpy.validate_full_topic_name import validate_full_topic_name
 from rclpy.validate_topic_name import validate_topic_name
 
 from pnv_core.errors import ConfigError
-from pnv_core.settings import checked, setting
+from pnv_core.settings import Section, checked, setting
 
 
 @dataclass(frozen=True)
 class NodeConfig:
     """Settings of the node; every instance is valid or raises ConfigError."""
 
-    # Inputs
+    _inputs = Section("Inputs")
     image_topics: tuple[str, ...] = setting(
         ("camera/image_raw",), "image topics, one per camera; closures name a camera by its index in this list"
     )
@@ -39,7 +39,7 @@ class NodeConfig:
     )
     pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
 
-    # Time
+    _time = Section("Time")
     on_stamp_back: str = setting(
         "skip",
         "frames whose stamp goes back by 1 s or more (a bag in a loop): skip them, or begin a new session",
@@ -49,7 +49,7 @@ class NodeConfig:
         5.0, "warn when no image came for so long", unit="s", low=0.1, high=1e6, live=True
     )
 
-    # Life
+    _life = Section("Life")
     autostart: bool = setting(True, "configure and activate at start; false leaves that to a life-cycle manager")
     map_path: str = setting("", "folder that ~/save writes and ~/load reads", live=True)
     load_on_start: bool = setting(False, "load map_path when configuring, if there is a map")
@@ -57,7 +57,7 @@ class NodeConfig:
     autosave_interval_s: float = setting(300.0, "time between autosaves", unit="s", low=1.0, high=1e6)
     read_only: bool = setting(False, "localise in the loaded map: nothing is added to it")
 
-    # Outputs
+    _outputs = Section("Outputs")
     publish_candidates: bool = setting(True, "publish ~/candidates while somebody subscribes", live=True)
     publish_markers: bool = setting(True, "publish ~/markers while somebody subscribes", live=True)
     publish_match_image: bool = setting(True, "publish ~/match_image while somebody subscribes", live=True)

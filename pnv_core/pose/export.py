@@ -1,14 +1,15 @@
-"""Closures for offline tools: CSV, and g2o pose graphs."""
+"""Closures and poses for offline tools: CSV, g2o pose graphs, TUM trajectories, image pairs."""
 
 import csv
 import io
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pnv_core.errors import PnvError
 from pnv_core.pose.geometry import RelativePose
 from pnv_core.types import LoopClosure
 
@@ -41,6 +42,29 @@ class GraphPose:
 
     position: Array
     quaternion: Array
+
+
+def poses_to_tum(poses: Mapping[int, GraphPose]) -> str:
+    """A trajectory by stamp in nanoseconds: `timestamp tx ty tz qx qy qz qw` a line, seconds and metres."""
+    lines = [
+        f"{stamp // 10**9}.{stamp % 10**9:09d} {_numbers(p.position)} {_numbers(p.quaternion)}"
+        for stamp, p in sorted(poses.items())
+    ]
+    return "".join(line + "\n" for line in lines)
+
+
+def pairs_to_hloc(pairs: Iterable[tuple[str, str]]) -> str:
+    """Image names, `query reference` a line, as hloc and COLMAP's matches importer read them.
+
+    Raises PnvError for a name with white space, which the format has no way to write.
+    """
+    lines = []
+    for pair in pairs:
+        for name in pair:
+            if not name or len(name.split()) != 1:
+                raise PnvError(f"image name {name!r}; allowed in a pairs file: names without white space")
+        lines.append(" ".join(pair) + "\n")
+    return "".join(lines)
 
 
 def graph_to_g2o(
@@ -81,7 +105,7 @@ def _edge(a: int, b: int, position: Array, quaternion: Array, information: Array
 
 
 def _numbers(values: Sequence[float] | Array) -> str:
-    return " ".join(f"{float(v):.9g}" for v in values)
+    return " ".join(f"{float(v) + 0.0:.9g}" for v in values)  # + 0.0: no negative zeros
 
 
 def _matrix(q: Array) -> Array:

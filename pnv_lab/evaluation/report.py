@@ -19,7 +19,7 @@ from pnv_lab.evaluation.evaluate import Evaluation, MethodResult
 from pnv_lab.evaluation.extraction import descriptor_of
 from pnv_lab.evaluation.metrics import precision_recall
 from pnv_lab.evaluation.summary import RECALLS, Figures, recall_curve
-from pnv_lab.evaluation.svg import Axis, Series, histogram, line_chart, path_map, scatter
+from pnv_lab.evaluation.svg import Axis, Series, histogram, legend, line_chart, path_map, scatter
 
 RIGHT, WRONG, MISSED = "#009e73", "#d55e00", "#56b4e9"
 SHOWN = 4  # pictures of each kind; bounds the file to a few megabytes
@@ -227,8 +227,9 @@ def _trajectory(results: Sequence[MethodResult]) -> str:
     for q, ranking in enumerate(result.rankings):
         if len(ranking.references) and (len(dataset.truth[q]) or result.decisions.scores[q] > _largest_wrong(result)):
             links.append((q, int(ranking.references[0]), RIGHT if result.decisions.right[q] else WRONG))
-    flat = flattened(dataset.query_positions)
-    return f"<div><h3>Path and best candidates of revisits</h3>{path_map(flat, links)}</div>"
+    flat, axes = flattened(dataset.query_positions)
+    key = legend(("right", "wrong"), (RIGHT, WRONG))
+    return f"<div><h3>Path and best candidates of revisits</h3>{path_map(flat, links, axes, key)}</div>"
 
 
 def _largest_wrong(result: MethodResult) -> float:
@@ -236,10 +237,10 @@ def _largest_wrong(result: MethodResult) -> float:
     return float(wrong.max()) if len(wrong) else -math.inf
 
 
-def flattened(positions: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """(N, 3) -> the two axes along which the path extends most."""
-    axes = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2])
-    return [(float(p[axes[0]]), float(p[axes[1]])) for p in positions]
+def flattened(positions: NDArray[np.float64]) -> tuple[list[tuple[float, float]], tuple[str, str]]:
+    """(N, 3) -> the path along the two axes where it extends most, and their names."""
+    a, b = sorted(np.argsort(-np.ptp(positions, axis=0), kind="stable")[:2])
+    return [(float(p[a]), float(p[b])) for p in positions], ("xyz"[a], "xyz"[b])
 
 
 def _galleries(evaluation: Evaluation, result: MethodResult) -> str:

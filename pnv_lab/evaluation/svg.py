@@ -99,25 +99,38 @@ def histogram(groups: Sequence[tuple[str, Sequence[int]]], x: Axis, colours: Seq
     return _figure(body, x, y, legend([name for name, _ in groups], colours))
 
 
-def path_map(points: Sequence[tuple[float, float]], links: Sequence[tuple[int, int, str]]) -> str:
-    """A path in the plane to scale, with links (from, to, colour) between its points."""
-    xs, ys = [p[0] for p in points], [p[1] for p in points]
-    span = max(max(xs) - min(xs), max(ys) - min(ys), 1e-9)
-    scale = (WIDTH - 40) / span
-    height = max(80.0, (max(ys) - min(ys)) * scale + 40)
-
-    def at(i: int) -> tuple[float, float]:
-        return 20 + (points[i][0] - min(xs)) * scale, height - 20 - (points[i][1] - min(ys)) * scale
-
-    track = " ".join("{:.1f},{:.1f}".format(*at(i)) for i in range(len(points)))
-    lines = [f'<polyline points="{track}" fill="none" stroke="#8a94a0" stroke-width="2"/>']
+def path_map(
+    points: Sequence[tuple[float, float]],
+    links: Sequence[tuple[int, int, str]],
+    axes: tuple[str, str] = ("x", "y"),
+    caption: str = "",
+) -> str:
+    """A path in the plane, metres to one scale on both axes, with links (from, to, colour) between its points."""
+    width, height = WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM
+    low = [min(p[i] for p in points) for i in (0, 1)]
+    high = [max(p[i] for p in points) for i in (0, 1)]
+    scale = 1.1 * max((high[0] - low[0]) / width, (high[1] - low[1]) / height, 1e-6)  # metres per pixel
+    spans = zip(low, high, (width, height), axes, strict=True)
+    x, y = (Axis(f"{n}, m", (a + b - scale * w) / 2, (a + b + scale * w) / 2) for a, b, w, n in spans)
+    at = [(_x(x, p[0]), _y(y, p[1])) for p in points]
+    track = " ".join(f"{a:.1f},{b:.1f}" for a, b in at)
+    body = [f'<polyline points="{track}" fill="none" stroke="#8a94a0" stroke-width="2"/>']
     for a, b, stroke in links:
-        (x1, y1), (x2, y2) = at(a), at(b)
-        lines.append(
+        (x1, y1), (x2, y2) = at[a], at[b]
+        body.append(
             f'<line x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}" stroke="{stroke}" stroke-width="1.5"/>'
             f'<circle cx="{x1:.1f}" cy="{y1:.1f}" r="3.5" fill="{stroke}"/>'
         )
-    return f'<figure><svg viewBox="0 0 {WIDTH} {height:.0f}" role="img">{"".join(lines)}</svg></figure>'
+    return _figure(body, x, y, caption)
+
+
+def score_colour(score: float) -> str:
+    """From orange (a score of 0.5 and less) over grey to blue (1)."""
+    stops = ((213, 94, 0), (150, 150, 150), (0, 114, 178))
+    share = min(max(2 * score - 1, 0.0), 1.0) * 2
+    low, high = stops[min(int(share), 1)], stops[min(int(share), 1) + 1]
+    part = share - min(int(share), 1)
+    return "#" + "".join(f"{round(a + (b - a) * part):02x}" for a, b in zip(low, high, strict=True))
 
 
 def legend(names: Sequence[str], colours: Sequence[str] | None = None) -> str:

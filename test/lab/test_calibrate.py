@@ -64,5 +64,5 @@ def test_a_sequence_too_short_and_a_wrong_table_are_refused_in_one_line(model, w
     table = tmp_path / "t.csv"
     table.write_text("image,place\n1,2\n")
     assert main(["calibrate", *flags, "--poses", str(table)]) == 2
-    assert "lacks the column frame, x, y" in capsys.readouterr().err
+    assert "lacks the column x, y;" in capsys.readouterr().err
     assert not out.exists()

@@ -57,4 +57,4 @@ def test_poses_without_a_report_are_refused(walk: Path, capsys: pytest.CaptureFi
 def test_poses_without_positions_are_refused(walk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (walk / "poses.csv").write_text("timestamp,lat,lon\n1,2,3\n")
     assert run(walk, "--report", str(walk / "run.html"), "--poses", str(walk / "poses.csv")) == 2
-    assert "lacks the column x, y, z" in capsys.readouterr().err
+    assert "lacks the column x, y;" in capsys.readouterr().err
