@@ -108,7 +108,7 @@ class Calibration:
                 models[name] = Logistic(bias, weights)
             width, height = given["image_size"]
             sizes = tuple(int(size) for size in given["patch_sizes"])
-            later = {name: given[name] for name in ("scale_weight", "verifier") if name in given}
+            later: dict[str, Any] = {name: given[name] for name in ("scale_weight", "verifier") if name in given}
             later |= {name: tuple(given.get(name, ())) for name in ("patch_strides", "patch_weights")}
             return cls(**models, scorer=given["scorer"], patch_sizes=sizes, image_size=(int(width), int(height)),
                        source=str(given["source"]), **later)  # fmt: skip

@@ -49,10 +49,12 @@ def unpack(codes: bytes) -> tuple[NDArray[np.float32], NDArray[np.float32], floa
         raise ValueError(f"packed features: {error}") from error
     if len(pairs) != 64 * count:
         raise ValueError(f"{len(pairs)} bytes of packed descriptors; allowed: {64 * count}")
-    points = np.frombuffer(codes, "<u2", 2 * count, _HEAD.size).reshape(count, 2).astype(np.float32) / _GRID
+    points = np.frombuffer(codes, "<u2", 2 * count, _HEAD.size).reshape(count, 2).astype(np.float32)
+    points /= _GRID
     both = np.frombuffer(pairs, np.uint8).reshape(count, 64)
     values = np.empty((count, 128), np.float32)
     values[:, ::2], values[:, 1::2] = both >> 4, both & 15
-    values = (values * (_LARGEST / 15)) ** 2
+    values *= _LARGEST / 15
+    values *= values
     values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
     return points, values, aspect

@@ -4,8 +4,10 @@ The frozen layers and the rendering are most of a step's work and give the same 
 N views, C' channels after the frozen layers, h x w cells.
 """
 
+import hashlib
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +20,9 @@ from pnv_lab.training.batches import Batch, Origin, PlaceBatches, assembled
 
 
 class FeaturePool:
-    """`groups` renderings of `batches`, on disk in `folder` (float16); building goes on where it was broken off.
+    """`groups` renderings of `batches`, on disk under `folder` (float16); building goes on where it was broken off.
 
+    What lies there is found again by everything that shapes it: images, options, frozen layers and number of groups.
     Training batch n draws `places` places from it, neighbours together, and `views` of their views.
     """
 
@@ -30,9 +33,11 @@ class FeaturePool:
 
     def build(self, trunk: CompactTrunk, layers: int, progress: Iterable[int] | None = None) -> None:
         """Render what is missing and pass it through the first `layers` of the trunk."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        done = self.folder / "done.json"
+        place = self.folder / self._key(trunk, layers)
+        place.mkdir(parents=True, exist_ok=True)
+        done = place / "done.json"
         ready = int(json.loads(done.read_text())) if done.exists() else 0
+        count = self.groups * self.batches.options.places * self.batches.options.views
         for number in progress or range(self.groups):
             if number < ready:
                 self.origins.append(self.batches.origins(number))
@@ -41,23 +46,32 @@ class FeaturePool:
             images = torch.from_numpy(np.stack([v.pixels for v in views])).permute(0, 3, 1, 2).float() / 255
             with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
                 maps = trunk.front(images.contiguous(memory_format=torch.channels_last), layers)
-            if not hasattr(self, "maps"):
-                self._open(tuple(maps.shape[1:]))
+            coordinates = np.stack([v.coordinates for v in views])
+            if not number:
+                _create(place / "maps.npy", (count, *maps.shape[1:]))
+                _create(place / "coordinates.npy", (count, *coordinates.shape[1:]))
+            if number == ready:
+                self._open(place)
             rows = slice(number * len(views), (number + 1) * len(views))
             self.maps[rows] = maps.half().contiguous().numpy()
-            self.coordinates[rows] = np.stack([v.coordinates for v in views])
+            self.coordinates[rows] = coordinates
             self.origins.append(origins)
             with atomic_write(done) as file:
                 file.write(json.dumps(number + 1).encode())
-        if not hasattr(self, "maps"):
-            self._open(tuple(json.loads((self.folder / "shape.json").read_text())))
+        self._open(place)
 
-    def _open(self, shape: tuple[int, ...]) -> None:
-        with atomic_write(self.folder / "shape.json") as file:
-            file.write(json.dumps(shape).encode())
-        count = self.groups * self.batches.options.places * self.batches.options.views
-        self.maps = _array(self.folder / "maps.npy", (count, *shape))
-        self.coordinates = _array(self.folder / "coordinates.npy", (count, *shape[1:], 3))
+    def _key(self, trunk: CompactTrunk, layers: int) -> str:
+        digest = hashlib.sha256(f"{self.batches.options} {self.groups} {layers}".encode())
+        for image in self.batches.images:
+            digest.update(repr(replace(image, rgb=image.rgb.shape)).encode())  # type: ignore[arg-type]
+            digest.update(image.rgb.tobytes())
+        for name, tensor in trunk.state_dict().items():
+            digest.update(name.encode() + tensor.float().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()[:24]
+
+    def _open(self, place: Path) -> None:
+        self.maps = np.lib.format.open_memmap(place / "maps.npy", mode="r+")
+        self.coordinates = np.lib.format.open_memmap(place / "coordinates.npy", mode="r+")
 
     def mild_maps(self, most: int = 1500) -> Iterable[Tensor]:
         """The first views of at most so many places, evenly drawn: (C', h, w) each."""
@@ -82,7 +96,5 @@ class FeaturePool:
         return assembled(origins, torch.from_numpy(self.maps[rows]), [self.coordinates[r] for r in rows])
 
 
-def _array(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    if path.exists():
-        return np.lib.format.open_memmap(path, mode="r+")
-    return np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape)
+def _create(path: Path, shape: tuple[int, ...]) -> None:
+    np.lib.format.open_memmap(path, mode="w+", dtype=np.float16, shape=shape).flush()

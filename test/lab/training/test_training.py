@@ -205,3 +205,28 @@ def test_triplet_training_resumes_at_the_last_cache(picture_folder, tmp_path):
     expected, found = whole.parts.state_dict(), resumed.parts.state_dict()
     assert all(torch.allclose(expected[name], found[name], atol=1e-6) for name in expected)
     assert sum(row["tuples"] for row in resumed.journal.rows()) > 0
+
+
+def test_a_pool_of_other_images_seed_layers_or_size_is_not_taken_for_this_one(pool, imagenet_file, picture_folder):
+    """Whatever lies in the folder, a pool's maps are those of its own views."""
+    trunk = imagenet_trunk(imagenet_file, 8, True)
+    images, options = pool.batches.images, pool.batches.options
+    changes = {
+        "images": (PlaceBatches(images[1:], options), 3, 11),
+        "seed": (PlaceBatches(images, replace(options, seed=options.seed + 1)), 3, 11),
+        "larger": (pool.batches, 4, 11),
+        "layers": (pool.batches, 3, 8),
+    }
+    for name, (batches, groups, layers) in changes.items():
+        other = FeaturePool(pool.folder, batches, groups, places=4, views=2)
+        other.build(trunk, layers)
+        for group in range(groups):
+            _, views = batches.render(group)
+            pixels = torch.from_numpy(np.stack([v.pixels for v in views])).permute(0, 3, 1, 2).float() / 255
+            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
+                maps = trunk.front(pixels.contiguous(memory_format=torch.channels_last), layers).half().numpy()
+            assert np.array_equal(other.maps[group * len(views) : (group + 1) * len(views)], maps), name
+    again = FeaturePool(pool.folder, pool.batches, 3, places=4, views=2)
+    pool.batches.render = lambda number: pytest.fail("what lies there was not used")
+    again.build(trunk, 11)
+    assert np.array_equal(again.maps, pool.maps)
