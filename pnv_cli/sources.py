@@ -117,7 +117,7 @@ def _read_timestamps(path: str, names: list[str]) -> list[int]:
 
 
 def video(path: str) -> FrameSource:
-    """The frames of a video file, stamped by its own frame times."""
+    """The frames of a video file, stamped by its own frame times; by its rate where the file has none."""
     import cv2
 
     from pnv_core.types import Frame
@@ -136,7 +136,8 @@ def video(path: str) -> FrameSource:
                 ok, bgr = capture.read()
                 if not ok:
                     return
-                yield str(number), Frame(round(number * 1e9 / fps), "camera", cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
+                stamp = round(capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6) or round(number * 1e9 / fps)
+                yield str(number), Frame(stamp, "camera", cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB))
                 number += 1
         finally:
             capture.release()

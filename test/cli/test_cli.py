@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from PIL import Image
 
 from pnv_cli.main import main
+from pnv_cli.sources import video
 from pnv_core.describe.model_files import save_model
 from test.core.small import small_model
 
@@ -144,6 +146,33 @@ def test_run_takes_stamps_from_a_csv_and_reads_videos(model, images, tmp_path):
     writer.release()
     assert main(["run", "--video", video, *flags]) == 0
     assert {(r["query"], r["match"]) for r in run_rows(out)} >= {("17", "5")}
+
+
+def with_durations(path, parts):
+    """Rewrites an mp4 of constant rate (ISO 14496-12, 8.6.1.2): (n, f) lets n frames stand f times as long."""
+    data = bytearray(path.read_bytes())
+    at = data.index(b"stts") - 4
+    (size,), (ticks,) = struct.unpack_from(">I", data, at), struct.unpack_from(">I", data, at + 20)
+    entries = b"".join(struct.pack(">II", count, factor * ticks) for count, factor in parts)
+    data[at : at + size] = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(parts)) + entries
+    for box in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):  # whose sizes grew; the pixels lie before them
+        start = data.index(box) - 4
+        struct.pack_into(">I", data, start, struct.unpack_from(">I", data, start)[0] + 16 + len(entries) - size)
+    at = data.index(b"edts")
+    data[at : at + 4] = b"free"  # the edit list knows the old length
+    path.write_bytes(data)
+
+
+def test_frames_of_a_video_carry_their_own_times(tmp_path):
+    """A camera that slows down in the dark gives a variable rate."""
+    path = tmp_path / "v.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (64, 48))
+    for level in range(9):
+        writer.write(np.full((48, 64, 3), 25 * level, np.uint8))
+    writer.release()
+    with_durations(path, [(3, 1), (3, 5), (3, 2)])
+    stamps = [frame.stamp_ns / 1e9 for _, frame in video(str(path)).frames]
+    assert stamps == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.8, 1.3, 1.8, 2.0, 2.2], abs=1e-3)
 
 
 def test_every_unusable_image_gets_one_line_that_names_it(model, images, tmp_path, capsys):
