@@ -23,7 +23,7 @@ MAX_PIXELS = 1 << 26  # 192 MiB as RGB; larger ones are refused from their heade
 _FULL_SCALES = (255, 1023, 4095, 16383, 65535)  # of 8, 10, 12, 14 and 16 bits
 _HOT = 1e-3  # share of the pixels that may lie beyond the full scale: hot pixels and glints
 _ORIENTATION = 0x0112  # EXIF 2.3, section 4.6.4
-_BOMB_SIZE = re.compile(r"\d+ pixels|$")
+_BOMB_SIZE = re.compile(r".*?(\d+ pixels).*")
 _UPRIGHT: dict[int, Callable[[NDArray], NDArray]] = {
     2: np.fliplr,
     3: lambda pixels: np.rot90(pixels, 2),
@@ -68,7 +68,8 @@ def decode_image(data: bytes, name: str, formats: tuple[str, ...] | None = None)
         wrong = "is no image of a known kind" if data else "is empty"
         raise ImageError(f"{name}: {wrong}; allowed: {', '.join(SUFFIXES)}") from None
     except Image.DecompressionBombError as error:  # Pillow refuses the largest before their sides can be asked
-        raise ImageError(f"{name}: {_BOMB_SIZE.search(str(error)).group()}; {limit}") from None
+        size = _BOMB_SIZE.sub(r"\1", str(error))
+        raise ImageError(f"{name}: {size}; {limit}") from None
     except (OSError, SyntaxError, ValueError, cv2.error) as error:
         raise ImageError(f"{name}: cannot be decoded ({' '.join(str(error).split())[:120]})") from None
 

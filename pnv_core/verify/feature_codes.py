@@ -57,4 +57,4 @@ def unpack(codes: bytes) -> tuple[NDArray[np.float32], NDArray[np.float32], floa
     values *= _LARGEST / 15
     values *= values
     values /= np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
-    return points, values, aspect
+    return points.astype(np.float32), values.astype(np.float32), aspect
