@@ -36,8 +36,8 @@ class PlaceRecognizer:
         self.timer = timer or StageTimer()
         self.budget = TimeBudget(self.timer.clock)
         self.keyframes = KeyframeSelector(self.config)
-        self.judge = Judge(describer.config, describer.model.info.calibration)
-        self.sequence = SequenceMemory()
+        self.judge = Judge(describer.config, describer.model.info.calibration, self.database.steps)
+        self.sequence = SequenceMemory(self.database.steps)
         self.latest: Query | None = None  # of the last frame processed; None where it was no keyframe
         self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
 

@@ -165,6 +165,7 @@ class KeyframeDatabase:
         self._in_memory: dict[int, None] = {}  # ids whose patches are in memory, oldest first
         self._keyframes: dict[int, StoredKeyframe] = {}
         self._ids: list[int] = []  # ascending
+        self._sequences: dict[tuple[int, str], list[int]] = {}  # ascending ids by (session, camera)
         self._cameras: dict[str, int] = {}
         self._patch_bytes = 0
 
@@ -299,6 +300,7 @@ class KeyframeDatabase:
         kept = self._table.vectors[row.slot]
         self._keyframes[ref.id] = StoredKeyframe(ref, kept, row, layouts, buffer, texture)
         self._ids.append(ref.id)
+        self._sequences.setdefault((ref.session, ref.camera), []).append(ref.id)
         self._patch_bytes += len(buffer)
         self._in_memory[ref.id] = None
         self._index.add(row.slot)
@@ -307,6 +309,8 @@ class KeyframeDatabase:
     def _remove(self, keyframe: int) -> None:
         stored = self._keyframes.pop(keyframe)
         del self._ids[bisect_left(self._ids, keyframe)]
+        sequence = self._sequences[stored.ref.session, stored.ref.camera]
+        del sequence[bisect_left(sequence, keyframe)]
         if keyframe in self._in_memory:
             self._patch_bytes -= stored.buffer.nbytes
             del self._in_memory[keyframe]
@@ -373,6 +377,17 @@ class KeyframeDatabase:
             if ref.camera == centre.camera:
                 found.append(ref)
         return found
+
+    def steps(self, earlier: ImageRef, later: ImageRef) -> int:
+        """How many keyframes the camera of `earlier` went on to `later`, of the same session; negative backwards.
+
+        Counted in the keyframes that are left, so that neither other cameras nor a thinned map make a way longer.
+        Of sequences that are not here (another robot's), in ids.
+        """
+        sequence = self._sequences.get((earlier.session, earlier.camera), [])
+        if earlier.robot or later.robot or not sequence:
+            return later.id - earlier.id
+        return bisect_left(sequence, later.id) - bisect_left(sequence, earlier.id)
 
     def last(self) -> ImageRef | None:
         """The keyframe added last, if any."""

@@ -5,10 +5,12 @@ again, forwards or backwards, at some other speed; a chance resemblance stands a
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pnv_core.types import ImageRef, LoopClosure
+
+Steps = Callable[[ImageRef, ImageRef], int]  # keyframes from one to a later one of its sequence
 
 _STEP = 6  # keyframes of the other visit that may pass per keyframe of this one
 _MISSES = 2  # queries in the window that may lack a match on the path: a person in the way, a blurred image
@@ -29,9 +31,14 @@ class Path:
 
 
 class SequenceMemory:
-    """The candidates of the latest query keyframes of every camera."""
+    """The candidates of the latest query keyframes of every camera.
 
-    def __init__(self) -> None:
+    `steps` counts in the sequence of a camera (KeyframeDatabase.steps): ids alone grow with every other camera and
+    leave gaps where a map was thinned.
+    """
+
+    def __init__(self, steps: Steps | None = None) -> None:
+        self._steps = steps or by_id
         self._queries: dict[str, deque[tuple[LoopClosure, ...]]] = {}
 
     def remember(self, camera: str, closures: Sequence[LoopClosure], window: int) -> None:
@@ -55,11 +62,11 @@ class SequenceMemory:
         """Backwards through the queries: of the matches in order and reach, take the best; a query may be missed."""
         at, length, total, steps, moved = closure.match, 1, closure.score, 1, False
         for candidates in reversed(earlier):
-            following = [c for c in candidates if _follows(c.match, at, way, steps)]
+            following = [c for c in candidates if self._follows(c.match, at, way, steps)]
             if not following:
                 steps += 1
                 continue
-            best = max(following, key=lambda c: (c.score, c.match.id != at.id, -abs(c.match.id - at.id)))
+            best = max(following, key=lambda c: (c.score, c.match.id != at.id, -abs(self._steps(c.match, at))))
             moved = moved or best.match.id != at.id
             at, steps = best.match, 1
             length, total = length + 1, total + best.score
@@ -67,11 +74,15 @@ class SequenceMemory:
             length = 1  # the other visit stood still: the same picture again and again is one witness, not many
         return Path(length, total / window, way if moved else 0)
 
+    def _follows(self, earlier: ImageRef, later: ImageRef, way: int, queries: int) -> bool:
+        """Whether `earlier` may be matched by the query `queries` before the one that matched `later`."""
+        same = (earlier.robot, earlier.session, earlier.camera) == (later.robot, later.session, later.camera)
+        return same and 0 <= way * self._steps(earlier, later) <= _STEP * queries
 
-def _follows(earlier: ImageRef, later: ImageRef, way: int, steps: int) -> bool:
-    """Whether `earlier` may be matched by the query `steps` before the one that matched `later`."""
-    same = (earlier.robot, earlier.session, earlier.camera) == (later.robot, later.session, later.camera)
-    return same and 0 <= way * (later.id - earlier.id) <= _STEP * steps
+
+def by_id(earlier: ImageRef, later: ImageRef) -> int:
+    """Steps where every keyframe is of one camera and none is missing."""
+    return later.id - earlier.id
 
 
 def confirmed(path: Path, wanted: int) -> bool:

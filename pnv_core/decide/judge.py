@@ -7,11 +7,12 @@ import numpy as np
 
 from pnv_core.config import Config
 from pnv_core.decide.calibration import Calibration, calibration_for
+from pnv_core.decide.consistency import Steps, by_id
 from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
 from pnv_core.verify.reranker import Reranker, SpatialResult
 from pnv_core.verify.verifier import VERIFIERS, hull_area
 
-_NEIGHBOURS = 10  # keyframes this close in number show one place
+_NEIGHBOURS = 10  # keyframes of a sequence this close to each other show one place
 
 Candidate = tuple[ImageRef, float]  # keyframe, similarity
 
@@ -19,7 +20,8 @@ Candidate = tuple[ImageRef, float]  # keyframe, similarity
 class Judge:
     """Scores the candidates of a query with the re-ranker and calibration of a completed Config."""
 
-    def __init__(self, config: Config, stored_calibration: dict | None) -> None:
+    def __init__(self, config: Config, stored_calibration: dict | None, steps: Steps | None = None) -> None:
+        self._steps = steps or by_id
         self.reranker = Reranker(config)
         self.verifier = VERIFIERS.make(config.verifier)
         self.calibration: Calibration = calibration_for(stored_calibration, config)
@@ -44,7 +46,7 @@ class Judge:
         found = []
         for number, (result, reference) in enumerate(zip(scored, references, strict=True)):
             ref, similarity = candidates[number]
-            elsewhere = [i for i, (other, _) in enumerate(candidates) if _apart(other, ref)]
+            elsewhere = [i for i, (other, _) in enumerate(candidates) if self._apart(other, ref)]
             evidence = Evidence(
                 similarity=similarity,
                 spatial=result.score,
@@ -75,6 +77,9 @@ class Judge:
         rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
         return sorted(closures + rest, key=_rank)
 
+    def _apart(self, a: ImageRef, b: ImageRef) -> bool:
+        return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
+
     def _closure(
         self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float
     ) -> LoopClosure:
@@ -92,10 +97,6 @@ def _not_reranked(query: ImageRef, match: ImageRef, similarity: float, texture: 
 
 def _rank(closure: LoopClosure) -> tuple[float, float, int]:
     return -closure.score, -closure.similarity, closure.match.id
-
-
-def _apart(a: ImageRef, b: ImageRef) -> bool:
-    return (a.robot, a.session) != (b.robot, b.session) or abs(a.id - b.id) > _NEIGHBOURS
 
 
 def _inlier_points(

@@ -5,8 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pnv_core.database import KeyframeDatabase
 from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
 from pnv_core.types import ImageRef, LoopClosure
+from test.database.synthetic import drive
 
 WANTED = 3
 
@@ -97,3 +99,52 @@ def test_chance_matches_are_hardly_ever_confirmed():
     """A thousand queries with a random match each among 1000 keyframes: the share confirmed stays under 1 %."""
     rng = np.random.default_rng(0)
     assert np.mean(confirmations(single(*rng.integers(0, 1000, 1000)))) < 0.01
+
+
+def confirmed_in(database, visited, wanted=WANTED):
+    """visited: per query of the front camera the keyframe it matched; the verdict on each."""
+    memory, verdicts = SequenceMemory(database.steps), []
+    for number, match in enumerate(visited, start=10_000):
+        found = LoopClosure(ImageRef(number, number * 10**9, "front"), match, 0.9, 0.5, 0.5, 50, False)
+        memory.remember("front", [found], window_of(wanted))
+        verdicts.append(confirmed(memory.path(found, window_of(wanted)), wanted))
+    return verdicts
+
+
+def database_of(cameras, places):
+    database = KeyframeDatabase(16)
+    for i, descriptor in enumerate(drive(np.random.default_rng(1), places * len(cameras), 0.1)):
+        database.add(i * 10**8, cameras[i % len(cameras)], descriptor)
+    return database
+
+
+@pytest.mark.parametrize("cameras", [1, 4, 8])
+@pytest.mark.parametrize("speed", [1, 2, -2])
+def test_a_way_is_confirmed_with_any_number_of_cameras_and_at_twice_the_speed(cameras, speed):
+    database = database_of([f"camera {c}" for c in range(cameras)], 12)
+    front = [ref for ref in database.refs() if ref.camera == "camera 0"]
+    assert confirmed_in(database, front[::speed])[2:] == [True] * (len(front[::speed]) - 2)
+
+
+@pytest.mark.parametrize("gap", [2, 7, 12])
+def test_a_way_is_confirmed_in_a_thinned_map(gap):
+    database = database_of(["front"], 5 * gap)
+    snapshot = database.snapshot()
+    kept = snapshot.keyframes[::gap]
+    thinned = database.prepared(kept, len(kept), snapshot.next_id, snapshot.next_session)
+    assert all(confirmed_in(thinned, thinned.refs())[2:])
+
+
+def test_far_leaps_in_the_sequence_of_a_camera_confirm_nothing():
+    database = database_of(["front", "rear"], 60)
+    front = [ref for ref in database.refs() if ref.camera == "front"]
+    assert not any(confirmed_in(database, front[::7]))
+
+
+def test_elsewhere_is_counted_in_the_sequence_of_a_camera():
+    """Eight cameras: five places on is still here, twenty are not; of another camera by when it was taken."""
+    database = database_of([f"camera {c}" for c in range(8)], 40)
+    refs = database.refs()
+    assert database.steps(refs[0], refs[5 * 8]) == 5
+    assert database.steps(refs[0], refs[5 * 8 + 3]) in (5, 6)
+    assert database.steps(refs[20 * 8], refs[0]) == -20
