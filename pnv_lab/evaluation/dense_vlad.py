@@ -19,7 +19,7 @@ from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.images import read_image
 from pnv_lab.evaluation.extraction import Progress
 from pnv_lab.evaluation.extractors import multiscale_vlad
-from pnv_lab.evaluation.store import content_key
+from pnv_lab.evaluation.store import code_version, content_key
 from pnv_lab.fit import pca, spherical_kmeans
 
 _IMAGES = 200  # evenly drawn from the references
@@ -35,7 +35,7 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
     rows = np.unique(np.linspace(0, len(references) - 1, min(_IMAGES, len(references))).round().astype(int))
     files = [references[i] for i in rows]
     size = (completed.image_width, completed.image_height)
-    drawn = [_CLUSTERS, _DIMENSIONS, _PER_DIMENSION, size, *(content_key(f) for f in files)]
+    drawn = [code_version(), _CLUSTERS, _DIMENSIONS, _PER_DIMENSION, size, *(content_key(f) for f in files)]
     target = cache / "densevlad" / f"{hashlib.sha256(json.dumps(drawn).encode()).hexdigest()[:24]}.safetensors"
     if target.is_file():
         return target

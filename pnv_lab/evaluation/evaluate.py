@@ -1,7 +1,5 @@
 """Evaluation: methods over a data set, with everything a table or a report shows. Q queries, R references."""
 
-import hashlib
-import json
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,15 +19,7 @@ from pnv_lab.evaluation.extraction import Describing, Extraction, Progress, lead
 from pnv_lab.evaluation.methods import Method
 from pnv_lab.evaluation.metrics import Decisions, first_hits, unique_groups
 from pnv_lab.evaluation.ranking import Ranking, rerank, retrieve
-from pnv_lab.evaluation.store import code_version
 
-_SCORING = tuple(
-    f"pnv_core.{name}"
-    for name in (
-        "matching", "spatial", "kernels", "reranker", "evaluation.methods", "evaluation.multiscale",
-        "evaluation.local_features",
-    )
-)  # fmt: skip
 _STORES = 8  # kinds of features that may be held at once share the memory budget
 MATRIX_SIDE = 160  # rows and columns kept of the similarity matrix
 
@@ -53,33 +42,8 @@ class MethodResult:
     reference_bytes: float
 
 
-class Journal:
-    """Scores of finished queries, one JSON line each, so that interrupted matching goes on where it stopped."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.done: dict[str, tuple[list[float], float]] = {}
-        try:
-            lines = path.read_text().splitlines()
-        except OSError:
-            lines = []
-        for line in lines:
-            try:
-                entry = json.loads(line)
-                self.done[entry["pair"]] = entry["scores"], entry["seconds"]
-            except (ValueError, KeyError, TypeError):
-                continue  # the line that was being written when the run was cut
-
-    def add(self, pair: str, scores: list[float], seconds: float) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        line = "\n" + json.dumps({"pair": pair, "scores": scores, "seconds": seconds})  # first: ends a torn line
-        with open(self.path, "ab") as file:
-            file.write(line.encode())
-        self.done[pair] = scores, seconds
-
-
 class Evaluation:
-    """Runs methods over data sets, keeping descriptors and match scores under `cache`.
+    """Runs methods over data sets, keeping descriptors under `cache`.
 
     depth: how many references a ranking holds; `config.candidates` of them are re-ranked.
     """
@@ -197,28 +161,13 @@ class Evaluation:
         keys: tuple[list[str], list[str]],
         rankings: Sequence[Ranking],
     ) -> Iterator[Ranking]:
-        """The rankings with their candidates re-ranked, in order; finished queries are noted as they finish."""
+        """The rankings with their candidates re-ranked, in order."""
         reference_keys, query_keys = keys
-        completed = self.completed(method.config(self.config))
-        score = method.pair_score(completed)
+        score = method.pair_score(self.completed(method.config(self.config)))
         assert score is not None
-        identity = [
-            features.extractor.fingerprint,
-            cv2.__version__,
-            code_version(*_SCORING),
-            *method.identity(completed),
-        ]
-        name = hashlib.sha256(json.dumps(identity, default=str).encode()).hexdigest()[:24]
-        journal = Journal(self.cache / "matches" / f"{name}.jsonl")
 
-        def one(q: int) -> tuple[int, str, Ranking]:
+        def one(q: int) -> Ranking:
             head = rankings[q].references[: self.config.candidates]
-            images = "".join([query_keys[q], *(reference_keys[r] for r in head)])
-            pair = hashlib.sha256(images.encode()).hexdigest()[:32]
-            if pair in journal.done:
-                stored, seconds = journal.done[pair]
-                lookup = dict(zip(head.tolist(), stored, strict=True))
-                return q, "", replace(rerank(rankings[q], len(head), lookup.__getitem__), seconds=seconds)
             record = features.record(query_keys[q], dataset.queries[q])
             seconds = rankings[q].seconds
 
@@ -230,16 +179,11 @@ class Evaluation:
                 seconds += time.perf_counter() - began
                 return value
 
-            return q, pair, replace(rerank(rankings[q], len(head), scored), seconds=seconds)
+            return replace(rerank(rankings[q], len(head), scored), seconds=seconds)
 
         with ThreadPoolExecutor(self.workers) as pool:
             done = _in_order(pool, one, len(rankings), 2 * self.workers)
-            for q, pair, ranking in self.progress(done, len(rankings), f"{dataset.name}, {method.name}"):
-                if pair:
-                    scores = dict(zip(ranking.references.tolist(), ranking.scores.tolist(), strict=True))
-                    head = rankings[q].references[: ranking.reranked].tolist()
-                    journal.add(pair, [scores[r] for r in head], ranking.seconds)
-                yield ranking
+            yield from self.progress(done, len(rankings), f"{dataset.name}, {method.name}")
 
     def _seconds(self, describing: Describing, keys: Sequence[str], paths: Sequence[Path]) -> float:
         """Median seconds of describing an image, as measured when it was described."""

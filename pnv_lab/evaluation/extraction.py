@@ -21,27 +21,23 @@ from numpy.typing import NDArray
 from pnv_core.config import Config
 from pnv_core.errors import ConfigError, PnvError
 from pnv_core.images import read_image
+from pnv_core.settings import settings_of
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_lab.evaluation.store import DescriptorStore, Record, code_version, content_key
 
-_ALWAYS = ("pnv_core.describe.describer", "pnv_lab.evaluation.extractors", "pnv_lab.evaluation.extraction")
-_TRUNKS = (
-    *(f"pnv_core.describe.trunks.{name}" for name in ("trunk", "vgg16", "compact", "rootsift")),
-    "pnv_core.describe.netvlad",
-)
-_CODE = {  # what a kind's records depend on beside _ALWAYS
-    "patchnetvlad": (*_TRUNKS, "pnv_core.describe.patches", "pnv_core.kernels"),
-    "average": _TRUNKS,
-    "maximum": _TRUNKS,
-    "gem": _TRUNKS,
-    "densevlad": ("pnv_core.describe.trunks.rootsift", "pnv_core.describe.netvlad"),
-}
-_LOCAL = ("pnv_lab.evaluation.local_features",)
+# Settings that no description depends on. An extractor sees their defaults, so that none of them can change a record;
+# every other setting, a new one too, is part of the key that a record is found by.
+_WITHOUT_EFFECT = (
+    "preset", "min_interval_s", "min_change", "exclude_recent_s", "candidates", "time_budget_ms", "index", "scorer",
+    "patch_weights", "scale_weight", "verifier", "verify", "accept_score", "min_texture", "consistency", "sure_score",
+    "odometry_drift", "odometry_slack_m", "min_travelled_m", "memory_budget_mb", "eviction", "patch_store",
+    "patch_folder", "disk_budget_gb",
+)  # fmt: skip
 Progress = Callable[[Iterable[Any], int, str], Iterable[Any]]  # (items, how many, what) -> the same items
 
 
 class Extractor(Protocol):
-    """Computes the record of an image. `fingerprint` tells apart everything that changes a record."""
+    """Computes the record of an image. `fingerprint` tells apart the models and settings that change a record."""
 
     fingerprint: str
 
@@ -50,10 +46,17 @@ class Extractor(Protocol):
 
 @dataclass(frozen=True)
 class Extraction:
-    """What to compute of every image: a kind of features under a Config. Small and picklable, for workers."""
+    """What to compute of every image: a kind of features under a Config. Small and picklable, for workers.
+
+    Of the Config only what a description may depend on is kept; the rest has its defaults.
+    """
 
     kind: str
     config: Config
+
+    def __post_init__(self) -> None:
+        unused = {name: s.default for name, s in settings_of(Config).items() if name in _WITHOUT_EFFECT}
+        object.__setattr__(self, "config", self.config.replace(**unused))
 
     def open(self) -> Extractor:
         """The extractor itself. Raises ModelError or ConfigError."""
@@ -104,8 +107,7 @@ class Describing:
     def __init__(self, extraction: Extraction, cache: Path, memory_mb: float = 256.0) -> None:
         self.extraction = extraction
         self.extractor = extraction.open()
-        code = code_version(*_ALWAYS, *_CODE.get(extraction.kind, _LOCAL))
-        identity = json.dumps([code, extraction.kind, self.extractor.fingerprint])
+        identity = json.dumps([code_version(), extraction.kind, self.extractor.fingerprint])
         name = hashlib.sha256(identity.encode()).hexdigest()[:24]
         self.store = DescriptorStore(cache / f"{extraction.kind}-{name}", memory_mb)
 

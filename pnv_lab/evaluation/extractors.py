@@ -1,11 +1,11 @@
 """The kinds of features an evaluation can extract. C channels, h x w feature map, K clusters, D dimensions."""
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
 from functools import partial
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -25,23 +25,20 @@ SIFT_BINS_PX = (4, 6, 8, 10)  # the four scales of DenseVLAD (Torii et al., CVPR
 _TRUNK_BIN_PX = 8  # of the RootSIFT trunk
 
 
-def fingerprint(*parts: object) -> str:
-    """A hash of everything that shapes a record."""
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+def fingerprint(describer: Describer) -> str:
+    """A hash of the model and of every setting; a number of threads and a file's name change no record."""
+    settings = dataclasses.asdict(describer.config.replace(threads=0, weights=""))
+    return hashlib.sha256(json.dumps([describer.fingerprint, settings], sort_keys=True).encode()).hexdigest()
 
 
 class _Describing:
     """What the extractors around a Describer share."""
 
-    def __init__(self, config: Config, kind: str) -> None:
+    def __init__(self, config: Config) -> None:
         self.describer = describer_from(config)
         self.config = self.describer.config
         self.precision = "float32" if self.config.patch_precision == "float32" else "float16"
-        done = self.config
-        self.fingerprint = fingerprint(
-            kind, self.describer.fingerprint, self.describer.image_size, done.patch_sizes, done.patch_strides,
-            done.patch_mode, self.precision,
-        )  # fmt: skip
+        self.fingerprint = fingerprint(self.describer)
 
     def pixels(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return resized(checked_image(rgb), *self.describer.image_size)
@@ -49,9 +46,6 @@ class _Describing:
 
 class PatchNetVLAD(_Describing):
     """Global NetVLAD vector and VLAD patches of every size, as the describer gives them."""
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config, "patchnetvlad")
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         return descriptor_record(self.describer.describe(rgb), self.precision)
@@ -61,7 +55,7 @@ class PooledPatches(_Describing):
     """The paper's ablation: NetVLAD retrieves, but patches are average- or max-pooled features, without VLAD."""
 
     def __init__(self, kind: str, config: Config) -> None:
-        super().__init__(config, kind)
+        super().__init__(config)
         self.pool: Callable[..., Tensor] = F.avg_pool2d if kind == "average" else F.max_pool2d
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
@@ -81,9 +75,6 @@ class PooledPatches(_Describing):
 
 class GeM(_Describing):
     """Generalised-mean pooling of the trunk's features (before its neck, if it has one): (C,) unit vector."""
-
-    def __init__(self, config: Config) -> None:
-        super().__init__(config, "gem")
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         with torch.inference_mode():
@@ -112,7 +103,7 @@ class DenseVLAD:
         trunk = self.describer.model.info.trunk
         if trunk != "rootsift":
             raise ConfigError(f"densevlad needs a model of trunk rootsift; {config.weights} has {trunk}")
-        self.fingerprint = fingerprint("densevlad", self.describer.fingerprint, self.describer.image_size, SIFT_BINS_PX)
+        self.fingerprint = fingerprint(self.describer)
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         with torch.inference_mode():
@@ -124,8 +115,8 @@ class LocalFeatures:
     """SIFT or LightGlue's features of the image at the size the other methods see."""
 
     def __init__(self, kind: str, config: Config) -> None:
-        size = describer_from(config).image_size
-        self.fingerprint = fingerprint(kind, size, cv2.__version__)
+        describer = describer_from(config)
+        self.fingerprint, size = fingerprint(describer), describer.image_size
         if kind == "sift":
             self.features: Callable[..., dict[str, NDArray]] = partial(sift_record, size=size)
         else:

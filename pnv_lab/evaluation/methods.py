@@ -88,13 +88,6 @@ class Method:
             )
         )
 
-    def identity(self, completed: Config) -> list[object]:
-        """Everything beside the features that a score of this method depends on."""
-        if self.scorer in ("", "sift", *LIGHTGLUE_KINDS):
-            return [self.scorer]
-        reranker = self.reranker(completed)
-        return [self.scorer, reranker.scorer, self.wanted_sizes(completed), reranker.weights, self.dim]
-
 
 def global_method() -> Method:
     """Retrieval by the global vector alone."""

@@ -7,12 +7,15 @@ import threading
 import zipfile
 from collections import OrderedDict
 from collections.abc import Mapping
-from importlib.util import find_spec
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+import pnv_core
 from pnv_core.describe.download import cache_folder
 from pnv_core.errors import PnvError
 
@@ -32,12 +35,19 @@ def content_key(path: Path) -> str:
     return _known_keys[known]
 
 
-def code_version(*modules: str) -> str:
-    """A hash of the source of modules, by name: what is stored by one version of them is not taken for another's."""
+@cache
+def code_version() -> str:
+    """A hash of the recogniser's and the evaluation's source and of the libraries that compute.
+
+    What another version stored is not taken for this one's: no list says which module changes what.
+    """
     digest = hashlib.sha256()
-    for name in modules:
-        origin = getattr(find_spec(name), "origin", None)
-        digest.update(Path(origin).read_bytes() if origin else name.encode())
+    for folder in (Path(pnv_core.__file__).parent, Path(__file__).parent):
+        for file in sorted(folder.rglob("*.py")):
+            digest.update(file.name.encode() + file.read_bytes())
+    for library in ("numpy", "opencv-python-headless", "pillow", "torch", "openvino", "lightglue"):
+        with suppress(PackageNotFoundError):
+            digest.update(f"{library} {version(library)}".encode())
     return digest.hexdigest()[:16]
 
 

@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,9 +17,11 @@ from pnv_core.describe.download import DEFAULT_MODEL
 from pnv_core.describe.model_files import Model
 from pnv_core.describe.netvlad import Projection
 from pnv_core.errors import ConfigError
+from pnv_core.settings import settings_of
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_lab.evaluation.datasets import open_dataset
 from pnv_lab.evaluation.datasets.dataset import Dataset
+from pnv_lab.evaluation.datasets.pairs import pairs_dataset
 from pnv_lab.evaluation.evaluate import Evaluation, MethodResult
 from pnv_lab.evaluation.extraction import Describing, Extraction, descriptor_of, descriptor_record, leading
 from pnv_lab.evaluation.grid import grid_search
@@ -99,8 +102,6 @@ def test_an_interrupted_evaluation_goes_on_to_the_same_result(dataset: Dataset, 
             Evaluation(SMALL, tmp_path / "cut", cut(after)).run(dataset, methods)
     stored = sorted((tmp_path / "cut").rglob("*.npz"))
     stored[0].write_bytes(stored[0].read_bytes()[:100])  # a file the disk lost half of
-    (journal,) = (tmp_path / "cut" / "matches").iterdir()
-    journal.write_text(journal.read_text()[:-7])  # a line cut by the power
     assert answers(Evaluation(SMALL, tmp_path / "cut", silent).run(dataset, methods)) == straight
     assert answers(Evaluation(SMALL, tmp_path / "cut", silent).run(dataset, methods)) == straight
 
@@ -115,6 +116,44 @@ def test_a_changed_image_or_setting_is_described_anew(root: Path, tmp_path: Path
     (after,) = first.describe_all([path], silent)
     assert before != after
     assert first.record(before, path)["global"].tolist() != first.record(after, path)["global"].tolist()
+
+
+def test_figures_follow_the_settings_whatever_was_cached_before(root: Path, tmp_path: Path) -> None:
+    """Queries seen from nearer: how much of their score the change of scale costs is a setting."""
+    for seed in range(5):
+        write(tmp_path / "near" / f"{seed}.png", cv2.resize(place(seed)[12:-12, 16:-16], place(seed).shape[1::-1]))
+    (tmp_path / "matches.csv").write_text("query,true_refs\n" + "".join(f"{s}.png,{s}.png\n" for s in range(5)))
+    dataset = pairs_dataset(tmp_path / "near", root / "map", tmp_path / "matches.csv")
+    methods = parse_methods("multi-ransac")
+    full = answers(Evaluation(SMALL.replace(scale_weight=1.0), tmp_path / "cache", silent).run(dataset, methods))
+    none = answers(Evaluation(SMALL.replace(scale_weight=0.0), tmp_path / "cache", silent).run(dataset, methods))
+    assert none == answers(Evaluation(SMALL.replace(scale_weight=0.0), tmp_path / "new", silent).run(dataset, methods))
+    assert none != full
+
+
+_OTHER = {
+    "preset": "speed", "device": "auto", "trunk_precision": "bfloat16", "patch_mode": "fast", "patch_sizes": (2, 4),
+    "patch_strides": (1, 2), "patch_weights": (0.3, 0.7), "patch_precision": "float16", "scorer": "rapid",
+    "eviction": "densest", "patch_store": "disk", "index": "exact", "patch_folder": "/", "verifier": "rootsift2",
+}  # fmt: skip
+
+
+def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_path: Path) -> None:
+    first = Extraction("patchnetvlad", SMALL)
+    folder = Describing(first, tmp_path).store.folder
+    told = []
+    for name, declared in settings_of(Config).items():
+        if name in ("weights", "threads"):  # the model's content counts; any number of threads describes alike
+            continue
+        now = getattr(SMALL, name)
+        more = isinstance(now, int | float) and (declared.high is None or now + 1 <= declared.high)
+        other = _OTHER[name] if name in _OTHER else now + 1 if more else now / 2
+        second = Extraction("patchnetvlad", SMALL.replace(**{name: other}))
+        if second != first:
+            told.append(name)
+            assert Describing(second, tmp_path).store.folder != folder, name
+    assert {"trunk_precision", "patch_mode", "patch_sizes", "image_width", "patch_precision"} <= set(told)
+    assert not {"scale_weight", "accept_score", "memory_budget_mb", "candidates"} & set(told)  # described once for all
 
 
 @pytest.mark.process
