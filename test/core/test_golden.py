@@ -1,10 +1,12 @@
 """The whole recogniser against the outputs of the authors' code and their exact float64 twins.
 
-K clusters, D = 128 dimensions; every golden file covers ten photographs and patch sizes 2, 5, 8.
+K clusters, D = 128 dimensions; every golden file covers ten photographs and patch sizes 2, 5, 8. They lie beside the
+project, not in it; test/golden holds a smaller set that every clone has.
 """
 
 import importlib.util
 import json
+from pathlib import Path
 
 import cv2
 import faiss
@@ -21,6 +23,9 @@ from pnv_core.describe.patches import patch_descriptors, patch_vlads
 from pnv_core.types import PatchGrid
 from pnv_core.verify.matching import mutual_nearest
 from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score
+
+if not (Path(__file__).parents[3] / "shared").is_dir():
+    pytest.skip("no ../shared beside the project; test/golden is checked all the same", allow_module_level=True)
 
 SIZES = (2, 5, 8)
 DIGESTS = {
