@@ -1,4 +1,5 @@
 # make install   the environment .venv, with ROS 2 (rclpy), torch and the tools
+# make shell     a shell in which `pnv` and `place_recognizer` are found
 # make demo      a sequence through the real node; IMAGES=DIR, VIDEO=FILE or BAG=DIR take your own
 # make slam-demo a pose graph closed by the node
 # make test      every test
@@ -15,41 +16,50 @@ TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
-.PHONY: install demo slam-demo test bench lint clean
+.PHONY: install shell demo slam-demo test bench lint clean
 
 install: $(READY) $(MESSAGES)
 
 $(READY): setup.py setup.cfg pyproject.toml
-	test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
+	@echo "installing into .venv: ROS 2, torch and the tools, a few minutes and about 2 GB"
+	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	    { echo "python3 -m venv failed; on Debian: apt-get install python3-venv" >&2; exit 2; }
-	$(BIN)/python -c "import torch" 2>/dev/null || \
+	@$(BIN)/python -c "import torch" 2>/dev/null || { echo "  torch"; \
 	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q $(TORCH) --extra-index-url $(TORCH_CPU); \
-	    else $(BIN)/pip install --progress-bar off -q $(TORCH); fi
-	$(BIN)/pip install --progress-bar off -q -e ".[ros,dev,interfaces]"
-	touch $@
+	    else $(BIN)/pip install --progress-bar off -q $(TORCH); fi; }
+	@echo "  rclpy, the message packages and the tools"
+	@$(BIN)/pip install --progress-bar off -q -e ".[ros,dev,interfaces]"
+	@touch $@
+	@echo "installed; for pnv and place_recognizer on the PATH: source .venv/bin/activate, or make shell"
 
 $(MESSAGES): $(READY) $(wildcard pnv_msgs/* pnv_msgs/*/*)
-	$(BIN)/python .ci/build_interfaces.py pnv_msgs
-	touch $@
+	@$(BIN)/python .ci/build_interfaces.py pnv_msgs
+	@touch $@
+
+shell: $(READY)
+	@echo "pnv and place_recognizer are on the PATH of this shell; exit leaves it"
+	@PATH="$(CURDIR)/$(BIN):$$PATH" VIRTUAL_ENV="$(CURDIR)/.venv" $${SHELL:-bash}
 
 demo: $(READY)
-	$(BIN)/python -m examples.demo $(if $(IMAGES),--images "$(IMAGES)") $(if $(VIDEO),--video "$(VIDEO)") \
+	@echo "demo: a camera and the node as two processes, over ROS 2; about two minutes"
+	@$(BIN)/python -m examples.demo $(if $(IMAGES),--images "$(IMAGES)") $(if $(VIDEO),--video "$(VIDEO)") \
 	    $(if $(BAG),--bag "$(BAG)") $(ARGS)
 
 slam-demo: $(READY)
-	$(BIN)/python -c "import gtsam, evo" 2>/dev/null || $(BIN)/pip install --progress-bar off -q -e ".[slam]"
-	$(BIN)/python -m examples.pose_graph $(ARGS)
+	@echo "slam-demo: a pose graph closed by the node, over ROS 2; some minutes"
+	@$(BIN)/python -c "import gtsam, evo" 2>/dev/null || $(BIN)/pip install --progress-bar off -q -e ".[slam]"
+	@$(BIN)/python -m examples.pose_graph $(ARGS)
 
 test: $(READY)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 bench: $(READY)
-	$(BIN)/python -m benchmarks.run
+	@$(BIN)/python -m benchmarks.run
 
 lint: $(READY)
-	$(BIN)/ruff check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
 
 clean:
 	rm -rf build install log out *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

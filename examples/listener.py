@@ -42,13 +42,22 @@ class Heard:
         return self.count("frames in") <= self.count("frames processed") + self.dropped
 
 
-def listen(node: Node, on_closures: Callable[[list[LoopClosure]], None]) -> Heard:
-    """Subscribe a node to everything; `on_closures` is called with the closures of each query as they arrive."""
+def listen(
+    node: Node,
+    on_closures: Callable[[list[LoopClosure]], None],
+    ours: Callable[[LoopClosure], bool] = lambda closure: True,
+) -> Heard:
+    """Subscribe a node to everything; `on_closures` is called with the closures of each query as they arrive.
+
+    What is not `ours` comes from another node of the same domain and is passed over.
+    """
     heard = Heard()
 
     def closures(message: Float64MultiArray) -> None:
         now = time.monotonic()
-        closures_of_query = closures_from_message(message)
+        closures_of_query = [closure for closure in closures_from_message(message) if ours(closure)]
+        if not closures_of_query:
+            return
         heard.arrived.setdefault(closures_of_query[0].query.stamp_ns, now)
         heard.closures += closures_of_query
         on_closures(closures_of_query)

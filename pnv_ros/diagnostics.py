@@ -47,7 +47,10 @@ class Diagnostics:
         span = max(now - then, 1e-9)
         rates = (received - received_then) / span, (processed - processed_then) / span
         silent = self._silent(now, settings.node.no_image_warning_s, settings.node.image_topics)
-        self._log_silence(now, {} if inputs.paused else silent, inputs)
+        if inputs.paused:
+            self._warned.clear()  # it says nothing about whether images come
+        else:
+            self._log_silence(now, silent, inputs)
 
         if self._statistics.autosave_failure:
             level, text = DiagnosticStatus.ERROR, f"autosave: {self._statistics.autosave_failure}"

@@ -1,7 +1,8 @@
 """ROS parameters generated from the declarations in Config and NodeConfig."""
 
+import difflib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,6 +43,7 @@ class Parameters:
             if name != "preset":
                 self._declare(setting, self._defaults[name])
         self.settings = self._read({})
+        self._name_unknown(node._parameter_overrides)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
 
@@ -51,6 +53,14 @@ class Parameters:
         except InvalidParameterValueException as error:
             raise ConfigError(f"{error}; allowed: {setting.allowed()}") from None
         return setting.check(_from_ros(value))
+
+    def _name_unknown(self, given: Iterable[str]) -> None:
+        """Warn of parameters given at the start that the node does not have, with the nearest one it has."""
+        for name in given:
+            if not (name in DECLARED or name.startswith("qos_overrides.") or self._node.has_parameter(name)):
+                near = difflib.get_close_matches(name, DECLARED, 1, 0.6)
+                meant = f"did you mean {near[0]}?" if near else "`place_recognizer --help` lists those it has"
+                self._node.get_logger().warning(f"no parameter {name}; {meant}")
 
     def _read(self, changes: dict[str, Any]) -> Settings:
         """The settings with `changes` on top. Raises ConfigError for what is not allowed."""

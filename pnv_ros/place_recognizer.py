@@ -10,9 +10,11 @@ import rclpy
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
 
 from pnv_core.errors import PnvError
 from pnv_ros.node import PlaceRecognizerNode
+from pnv_ros.parameters import DECLARED
 
 UNUSABLE_INPUT = 2
 
@@ -42,11 +44,39 @@ class Spinning:
         self._executor.shutdown()
 
 
+def help_text() -> str:
+    """What --help prints: how to give parameters, and all of them."""
+    lines = [f"  {s.name:<22}{_default(s.default):<22}{s.doc}" for s in DECLARED.values()]
+    return "\n".join(
+        [
+            "usage: place_recognizer [--help] [--ros-args [-p NAME:=VALUE ...] [--params-file FILE]]\n",
+            "Camera images in, loop closures out on /loop_closures. For example:",
+            "  place_recognizer --ros-args -p image_topics:=\"['/camera/image_raw']\" --log-level debug\n",
+            f"{'parameter':<24}{'default':<22}meaning",
+            *lines,
+        ]
+    )
+
+
+def _default(value: object) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(list(value)) if isinstance(value, tuple) else str(value) or "''"
+
+
 def main(args: list[str] | None = None) -> int:
     """0 after SIGINT or SIGTERM, 2 for unusable settings, 1 with the traceback after a failure.
 
     1 too where autosave is on and the last save failed.
     """
+    others = remove_ros_args(sys.argv if args is None else [sys.argv[0], *args])[1:]
+    if "--help" in others or "-h" in others:
+        print(help_text())
+        return 0
+    if others:
+        how = "allowed: parameters, as --ros-args -p NAME:=VALUE (--help lists them)"
+        print(f"place_recognizer: {' '.join(others)}; {how}", file=sys.stderr)
+        return UNUSABLE_INPUT
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))

@@ -20,6 +20,7 @@ from pnv_ros.statistics import Drop, Statistics
 from pnv_ros.view import View
 
 _REPEAT_S = 10.0  # the same complaint is not made more often
+_TELL_S = 5.0  # between two lines about closed loops
 
 
 class Recognition:
@@ -42,6 +43,7 @@ class Recognition:
         self._still = threading.Lock()
         self._sizes: dict[str, tuple[int, int]] = {}
         self._complained: dict[str, float] = {}
+        self._told, self._untold = -_TELL_S, 0
 
     def still(self) -> AbstractContextManager[Any]:
         """No frame is processed while this is held."""
@@ -99,6 +101,7 @@ class Recognition:
                     self.outputs.publish(frame, closures, self._picture_of)
         accepted = sum(c.accepted for c in closures)
         self._statistics.process(closures[0].score if closures else None, accepted, _in_words(closures))
+        self._tell(closures, accepted)
 
     def _picture_of(self, keyframe: int) -> bytes:
         return self.recognizer.database.descriptor(keyframe).thumbnail
@@ -117,6 +120,17 @@ class Recognition:
                     "both are resized to the model's input, but one topic should carry one camera",
                 )
             return self.views[waiting.camera](frame)
+
+    def _tell(self, closures: list[LoopClosure], accepted: int) -> None:
+        """A line per closed loop, at most one in some seconds; with --log-level debug why the best was refused."""
+        if closures and not accepted:
+            self._log.debug(f"refused as {closures[0].reason}: {_in_words(closures)}")
+        self._untold += accepted
+        now = time.monotonic()
+        if accepted and now - self._told >= _TELL_S:
+            more = f"; {self._untold} closures since the last line" if self._untold > accepted else ""
+            self._log.info(f"loop closed: {_in_words(closures)}{more}")
+            self._told, self._untold = now, 0
 
     def _complain(self, about: str, text: str) -> None:
         now = time.monotonic()

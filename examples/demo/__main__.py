@@ -14,7 +14,7 @@ from pathlib import Path
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from examples.demo.report import LIGHT_AND_LINE, Run, plot, print_table, rows, write_match
+from examples.demo.report import LIGHT_AND_LINE, Run, Shown, plot, print_table, rows, write_match
 from examples.listener import listen
 from examples.processes import Process, isolated_environment, node_process, publisher_process
 from examples.publisher import IMAGE_TOPIC
@@ -22,7 +22,6 @@ from examples.sources import add_source_flags, is_file_source, named_frames, sou
 from pnv_cli.run import COLUMNS
 from pnv_core.errors import PnvError
 from pnv_core.files import atomic_write
-from pnv_core.types import LoopClosure
 
 _START_S, _SETTLE_S = 120.0, 30.0
 
@@ -60,7 +59,8 @@ def play(args: argparse.Namespace) -> Run:
         print(f"{args.world}, {len(run.truth)} rendered frames, {args.laps:g} laps; {LIGHT_AND_LINE}", flush=True)
     rclpy.init(args=[])
     listener = rclpy.create_node("demo_listener")
-    run.heard = listen(listener, lambda closures: print(_sentence(closures, run), flush=True))
+    shown = Shown(run)
+    run.heard = listen(listener, shown.closures, run.knows)
     parameters = {"image_topics": [IMAGE_TOPIC], "exclude_recent_s": args.exclude_recent_s}
     log = sys.stderr if args.node_log else None
     try:
@@ -68,18 +68,19 @@ def play(args: argparse.Namespace) -> Run:
             node_process(environment, parameters, args.parameter, log) as node,
             publisher_process(environment, [*source_flags(args), "--playback", str(playback)]) as publisher,
         ):
-            _follow(listener, run, node, publisher)
+            _follow(listener, run, node, publisher, shown)
     finally:
         listener.destroy_node()
         rclpy.try_shutdown()
     return run
 
 
-def _follow(listener: rclpy.node.Node, run: Run, node: Process, publisher: Process) -> None:
+def _follow(listener: rclpy.node.Node, run: Run, node: Process, publisher: Process, shown: Shown) -> None:
     started, ended, statuses = time.monotonic(), 0.0, 0
     while True:
         rclpy.spin_once(listener, timeout_sec=0.1)
         now = time.monotonic()
+        shown.progress(len(publisher.lines), bool(node.lines), publisher.return_code is not None)
         if node.return_code is not None:
             raise PnvError(f"the node ended with {node.return_code}; its last words:\n" + "\n".join(node.lines[-15:]))
         if not publisher.lines and publisher.return_code is None and now - started > _START_S:
@@ -91,19 +92,10 @@ def _follow(listener: rclpy.node.Node, run: Run, node: Process, publisher: Proce
             ended, statuses = now, run.heard.counted
         if ended and ((run.heard.settled and run.heard.counted >= statuses + 2) or now - ended > _SETTLE_S):
             break
+    shown.clear()
     if publisher.return_code:
         raise PnvError("\n".join(line for line in publisher.lines if not line.startswith("{"))[-2000:])
     run.take(publisher.json_lines())
-
-
-def _sentence(closures: list[LoopClosure], run: Run) -> str:
-    """The best closure of a query, and how many more it has."""
-    best = closures[0]
-    query, match = (run.seconds(ref.stamp_ns) for ref in (best.query, best.match))
-    verdict = {True: "right", False: "WRONG", None: ""}[run.right(best)]
-    more = f"and {len(closures) - 1} more" if len(closures) > 1 else ""
-    words = f"loop closure: {query:7.2f} s is the place of {match:7.2f} s", f"score {best.score:.3f}", verdict, more
-    return "  " + "   ".join(word for word in words if word)
 
 
 def report(args: argparse.Namespace, run: Run) -> int:
@@ -121,6 +113,10 @@ def report(args: argparse.Namespace, run: Run) -> int:
         write_match(run, args, args.out / "match.png")
         written.append("match.png")
     print("written: " + ", ".join(str(args.out / name) for name in written))
+    if run.heard.closures:
+        print(run.sentence())
+    if run.truth is not None:
+        print("your own: make demo BAG=DIR (or IMAGES=DIR, VIDEO=FILE), and without ROS: .venv/bin/pnv run PATH")
     if not run.heard.closures:
         span = run.span_s
         print(

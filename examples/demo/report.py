@@ -1,6 +1,8 @@
 """What the demo says in the end: table, rows, plot of query against match, picture of the best closure."""
 
 import argparse
+import sys
+import time
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -58,12 +60,27 @@ class Run:
         numbers = {stamp: number for number, stamp in enumerate(self.truth.stamps_ns)}
         return numbers, self.truth.places(RADIUS_M, HEADING_DEG)
 
+    def knows(self, closure: LoopClosure) -> bool:
+        """Whether a closure may be of this run: where the frames are known, only if both images are among them."""
+        stamps = closure.query.stamp_ns, closure.match.stamp_ns
+        return self._places is None or all(stamp in self._places[0] for stamp in stamps)
+
     def right(self, closure: LoopClosure) -> bool | None:
         """Whether both images show one place; None where that is not known."""
         if self._places is None:
             return None
         numbers, places = self._places
         return bool(places[numbers[closure.query.stamp_ns], numbers[closure.match.stamp_ns]])
+
+    def sentence(self) -> str:
+        """The outcome in a line that one may repeat."""
+        queries = {c.query.stamp_ns for c in self.heard.closures}
+        waited = f", {np.median(self.latencies_ms):.0f} ms after the image" if len(self.latencies_ms) else ""
+        found = f"{len(queries)} times the camera came back to a place the node knew, and it said so{waited}"
+        if self.truth is None:
+            return f"{found}."
+        wrong = self.verdicts.count(False)
+        return f"{found}: {len(self.verdicts) - wrong} of {len(self.verdicts)} closures right, {wrong or 'none'} wrong."
 
     @property
     def verdicts(self) -> list[bool | None]:
@@ -74,6 +91,58 @@ class Run:
         """From publishing the image to its result, of every query that had one."""
         both = sorted(set(self.heard.arrived) & set(self.sent))
         return np.array([1e3 * (self.heard.arrived[stamp] - self.sent[stamp]) for stamp in both])
+
+
+class Shown:
+    """What is seen while it runs: every closure as it comes, and in between how far it is.
+
+    On a terminal the last line is redrawn; elsewhere a line is printed every ten seconds.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self._run, self._terminal = run, sys.stdout.isatty()
+        self._printed, self._drawn = time.monotonic(), ""
+
+    def closures(self, closures: list[LoopClosure]) -> None:
+        """A query with its closures, best first, each with whether it is right."""
+        self.clear()
+        places = [self._place(closure) for closure in closures]
+        query = self._run.seconds(closures[0].query.stamp_ns)
+        more = f"   also {', '.join(places[1:])}" if places[1:] else ""
+        print(
+            f"  loop closure: {query:7.2f} s is the place of {places[0]}   score {closures[0].score:.3f}{more}",
+            flush=True,
+        )
+
+    def _place(self, closure: LoopClosure) -> str:
+        verdict = {True: " right", False: " WRONG", None: ""}[self._run.right(closure)]
+        return f"{self._run.seconds(closure.match.stamp_ns):6.2f} s{verdict}"
+
+    def progress(self, sent: int, node_speaks: bool, ended: bool) -> None:
+        """Called a few times a second."""
+        heard = self._run.heard
+        total = f" of {len(self._run.truth)}" if self._run.truth is not None else ""
+        if not sent:
+            words = "the camera waits for the node" if node_speaks else "starting the node and the camera"
+        else:
+            words = "waiting for the last results; " if ended else ""
+            words += f"frame {sent}{total}, {heard.count('keyframes')} keyframes, best score of late "
+            words += heard.counts.get("best score of late", "none")
+        now = time.monotonic()
+        if self._terminal:
+            if words != self._drawn:
+                self.clear()
+                print(f"  {words}", end="\r", flush=True)
+                self._drawn = words
+        elif now - self._printed >= 10.0 or (not sent and words != self._drawn):
+            print(f"  {words}", flush=True)
+            self._printed, self._drawn = now, words
+
+    def clear(self) -> None:
+        """Wipe the redrawn line."""
+        if self._terminal and self._drawn:
+            print(" " * (len(self._drawn) + 2), end="\r", flush=True)
+            self._drawn = ""
 
 
 def print_table(run: Run) -> None:

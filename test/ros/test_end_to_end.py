@@ -1,6 +1,7 @@
 """Real frames through the installed executable, the real algorithm and the real middleware."""
 
 import csv
+import re
 import signal
 from pathlib import Path
 
@@ -86,6 +87,8 @@ def test_at_the_default_settings_a_second_lap_is_recognised_and_nothing_wrong_is
     with running_node(exclude_recent_s=10, **RELIABLE) as node:
         assert publisher("--reliable", "--stamps", table, "--rate", "5", "--linger", "3").wait() == 0
         wait_until(lambda: arrived, 30, "a closure")
+        line = node.wait_for("loop closed", 30)
+        assert re.search(r"loop closed: \d+\.\d+ \(camera.*\) matches \d+\.\d+ .*score 0\.\d{3}", line)
         assert node.end(signal.SIGINT) == 0
 
     for closure in (c for message in arrived for c in closures_from_message(message)):

@@ -1,6 +1,7 @@
 """Topics, services and parameters of a node that gets no images."""
 
 import re
+import subprocess
 
 import pytest
 from rcl_interfaces.srv import DescribeParameters
@@ -10,7 +11,7 @@ from msg_adapters.typed_closures import typed_type
 from pnv_ros.parameters import DECLARED
 from test.ros.camera import Health
 from test.ros.controls import number, set_together, trigger
-from test.ros.processes import NODE, ROOT, running_node, wait_until
+from test.ros.processes import NODE, ROOT, executable, running_node, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.process
 @pytest.fixture(scope="module")
 def idle(domain):
     """A node that gets no images; whoever changes its settings puts them back."""
-    with running_node(no_image_warning_s=0.5) as node:
+    with running_node(no_image_warning_s=0.5, acept_score=0.7) as node:
         yield node
         assert node.end() == 0
         assert "Traceback" not in node.output
@@ -104,3 +105,20 @@ def test_services_answer_with_what_they_did(idle, listener):
     assert pause.success
     wait_until(lambda: Health(listener).status.message == "paused", 60, "paused")
     assert listener.call(SetBool, f"{NODE}/pause", SetBool.Request(data=False)).message == "running"
+    assert "images come" not in idle.output  # there is no camera
+
+
+def test_an_unknown_parameter_is_named_with_the_nearest_known_one(idle):
+    assert "no parameter acept_score; did you mean accept_score?" in idle.output
+    assert idle.output.count("no parameter") == 1
+
+
+def test_help_helps_instead_of_starting():
+    told = subprocess.run([executable(), "--help"], capture_output=True, text=True, timeout=60)
+    assert told.returncode == 0
+    assert all(re.search(rf"^  {name} ", told.stdout, re.M) for name in DECLARED)
+    told = subprocess.run([executable(), "accept_score:=0.7"], capture_output=True, text=True, timeout=60)
+    assert told.returncode == 2
+    assert told.stderr == (
+        "place_recognizer: accept_score:=0.7; allowed: parameters, as --ros-args -p NAME:=VALUE (--help lists them)\n"
+    )
