@@ -40,6 +40,8 @@ INTERFACES = [  # what building pnv_msgs needs where there is no ROS installatio
     ),
 ]  # fmt: skip
 
+FLEET = ["pymilvus>=2.6", "milvus-lite>=3"]  # Milvus' client, and a Milvus of one process
+
 DASK = ["distributed>=2024.1"]  # evaluation on several machines; lighter than Ray
 
 DEVELOPMENT = [
@@ -73,7 +75,7 @@ setup(
     maintainer_email="pnv_ros@users.noreply.github.com",
     license="MIT",
     python_requires=">=3.11",
-    packages=find_packages(include=["pnv_core*", "pnv_lab*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
+    packages=find_packages(include=["pnv_core*", "pnv_lab*", "pnv_fleet*", "msg_adapters*", "pnv_ros*", "pnv_cli*"]),
     package_data={"pnv_core": ["models/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -82,7 +84,14 @@ setup(
         (f"share/{PACKAGE}/config", glob("config/*")),
     ],
     install_requires=REQUIRED,
-    extras_require={"ros": ROS, "interfaces": INTERFACES, "dev": DEVELOPMENT, "slam": SLAM, "dask": DASK},
+    extras_require={
+        "ros": ROS,
+        "interfaces": INTERFACES,
+        "dev": DEVELOPMENT,
+        "slam": SLAM,
+        "dask": DASK,
+        "fleet": FLEET,
+    },
     entry_points={
         "console_scripts": [
             "place_recognizer = pnv_ros.place_recognizer:main",

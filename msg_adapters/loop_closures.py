@@ -29,6 +29,7 @@ COLUMNS = (
     "query_camera",
     "match_camera",
 )
+ROBOTS = ("query_robot", "match_robot")  # appended where a closure is with another robot's, or another day's, places
 
 NO_CAMERA = -1  # a match in a saved map whose camera is not among the topics of this run
 
@@ -49,6 +50,7 @@ CANDIDATE_FIELDS = {
     "reason": "<u1",
 }
 _TABLE = np.dtype([*CANDIDATE_FIELDS.items(), ("padding", "V6")])  # rows stay aligned to 8 bytes
+_NAMED = np.dtype([*CANDIDATE_FIELDS.items(), ("padding", "V2"), *((name, "<i4") for name in ROBOTS), ("more", "V4")])
 _REASON_CODES = {reason: code for code, reason in enumerate(Reason)}
 _POINT_TYPES = {
     "i4": PointField.INT32,
@@ -65,13 +67,22 @@ def epoch_seconds(stamp_ns: int) -> float:
     return min(stamp_ns / 1e9, math.nextafter(second + 1.0, second))
 
 
+def robots_of(closures: Sequence[LoopClosure]) -> list[str]:
+    """The robots that closures name, in order; none where all are of one robot's own map."""
+    return list(dict.fromkeys(r.robot for c in closures for r in (c.query, c.match) if r.robot))
+
+
 def to_time(stamp_ns: int) -> Time:
     """Nanoseconds as builtin_interfaces/Time."""
     return Time(sec=stamp_ns // 1_000_000_000, nanosec=stamp_ns % 1_000_000_000)
 
 
 def closures_to_message(closures: Sequence[LoopClosure], cameras: Sequence[str]) -> Float64MultiArray:
-    """N closures -> Float64MultiArray of N x C doubles in the given order; cameras become their index in `cameras`."""
+    """N closures -> Float64MultiArray of N x C doubles in the given order; cameras become their index in `cameras`.
+
+    Where robots are named there are two columns more, indices into the names behind the columns in the label:
+    "...,match_camera,query_robot,match_robot|alpha|beta".
+    """
     rows = [
         (
             epoch_seconds(c.query.stamp_ns),
@@ -90,12 +101,17 @@ def closures_to_message(closures: Sequence[LoopClosure], cameras: Sequence[str])
         for c in closures
     ]
     message = Float64MultiArray()
-    count, width = len(rows), len(COLUMNS)
+    robots: list[tuple[int, ...]] = [()] * len(rows)
+    names, label, count, width = robots_of(closures), ",".join(COLUMNS), len(rows), len(COLUMNS)
+    if names:
+        label = "|".join([",".join(COLUMNS + ROBOTS), *names])
+        robots = [(names.index(c.query.robot), names.index(c.match.robot)) for c in closures]
+        width += len(ROBOTS)
     message.layout.dim = [
         MultiArrayDimension(label="closures", size=count, stride=count * width),
-        MultiArrayDimension(label=",".join(COLUMNS), size=width, stride=width),
+        MultiArrayDimension(label=label, size=width, stride=width),
     ]
-    message.data = [float(value) for row in rows for value in row]
+    message.data = [float(value) for row, pair in zip(rows, robots, strict=True) for value in (*row, *pair)]
     return message
 
 
@@ -107,18 +123,19 @@ def closures_from_message(message: Any, cameras: Sequence[str] = ()) -> list[Loo
     dims = message.layout.dim
     if len(dims) != 2 or dims[0].label != "closures":
         raise PnvError(f"message has dimensions {[d.label for d in dims]}; allowed: closures, {','.join(COLUMNS)}")
-    names = dims[1].label.split(",")
+    label, *robots = dims[1].label.split("|")
+    names = label.split(",")
     missing = [name for name in COLUMNS if name not in names]
     if missing or len(names) != dims[1].size:
         raise PnvError(f"message has columns {dims[1].label!r}; allowed: at least {','.join(COLUMNS)}")
     if len(message.data) != dims[0].size * dims[1].size:
         raise PnvError(f"message has {len(message.data)} values; allowed: {dims[0].size} x {dims[1].size}")
     table = np.asarray(message.data, np.float64).reshape(dims[0].size, dims[1].size)
-    column = {name: table[:, names.index(name)] for name in COLUMNS}
+    column = {name: table[:, names.index(name)] for name in COLUMNS + ROBOTS if name in names}
     return [
         LoopClosure(
-            query=_ref("query", row, column, cameras),
-            match=_ref("match", row, column, cameras),
+            query=_ref("query", row, column, cameras, robots),
+            match=_ref("match", row, column, cameras, robots),
             score=float(column["score"][row]),
             similarity=float(column["similarity"][row]),
             spatial=float(column["spatial"][row]),
@@ -140,25 +157,29 @@ def closure_to_lio_sam(closure: LoopClosure) -> Float64MultiArray:
 def candidates_to_message(closures: Sequence[LoopClosure], cameras: Sequence[str], frame_id: str = "") -> PointCloud2:
     """Every candidate examined as a typed table, one point per candidate; `reason` is the number in Reason's order.
 
-    The header carries the query's stamp.
+    The header carries the query's stamp. Where robots are named, two fields more are indices into the names behind the
+    last field's: "match_robot|alpha|beta".
     """
-    table = np.zeros(len(closures), _TABLE)
+    names = robots_of(closures)
+    table = np.zeros(len(closures), _NAMED if names else _TABLE)
     for row, c in zip(table, closures, strict=True):
         for side, ref in (("query", c.query), ("match", c.match)):
             row[f"{side}_sec"], row[f"{side}_nsec"] = divmod(ref.stamp_ns, 1_000_000_000)
             row[f"{side}_id"] = ref.id
             row[f"{side}_camera"] = _camera_index(ref.camera, cameras)
+            if names:
+                row[f"{side}_robot"] = names.index(ref.robot)
         for name in ("score", "similarity", "spatial", "inliers", "accepted"):
             row[name] = getattr(c, name)
         row["reason"] = _REASON_CODES[c.reason]
-    message = PointCloud2(height=1, width=len(table), point_step=_TABLE.itemsize, row_step=table.nbytes, is_dense=True)
+    message = PointCloud2(height=1, width=len(table), point_step=table.itemsize, row_step=table.nbytes, is_dense=True)
     message.header.frame_id = frame_id
     if closures:
         message.header.stamp = to_time(closures[0].query.stamp_ns)
-    offset = 0
-    for name, kind in CANDIDATE_FIELDS.items():
-        message.fields.append(PointField(name=name, offset=offset, datatype=_POINT_TYPES[kind[1:]], count=1))
-        offset += np.dtype(kind).itemsize
+    for name in [*CANDIDATE_FIELDS, *(ROBOTS if names else ())]:
+        kind, offset = table.dtype.fields[name][:2]  # type: ignore[index]
+        full = "|".join([name, *names]) if name == ROBOTS[-1] else name
+        message.fields.append(PointField(name=full, offset=offset, datatype=_POINT_TYPES[kind.str[1:]], count=1))
     message.data = table.tobytes()
     return message
 
@@ -167,10 +188,12 @@ def _camera_index(camera: str, cameras: Sequence[str]) -> int:
     return cameras.index(camera) if camera in cameras else NO_CAMERA
 
 
-def _ref(side: str, row: int, column: dict[str, Any], cameras: Sequence[str]) -> ImageRef:
+def _ref(side: str, row: int, column: dict[str, Any], cameras: Sequence[str], robots: Sequence[str]) -> ImageRef:
     camera = int(column[f"{side}_camera"][row])
+    robot = int(column[f"{side}_robot"][row]) if f"{side}_robot" in column else -1
     return ImageRef(
         id=int(column[f"{side}_id"][row]),
         stamp_ns=math.floor(column[f"{side}_stamp"][row]) * 1_000_000_000 + int(column[f"{side}_nsec"][row]),
         camera=cameras[camera] if 0 <= camera < len(cameras) else str(camera),
+        robot=robots[robot] if 0 <= robot < len(robots) else "",
     )

@@ -52,6 +52,7 @@ class Diagnostics:
         else:
             self._log_silence(now, silent, inputs)
 
+        fleet = self._recognition.fleet.status() if self._recognition.fleet is not None else None
         if self._statistics.autosave_failure:
             level, text = DiagnosticStatus.ERROR, f"autosave: {self._statistics.autosave_failure}"
         elif inputs.paused:
@@ -64,9 +65,11 @@ class Diagnostics:
         elif behind > behind_then:
             level = DiagnosticStatus.WARN
             text = f"{behind - behind_then} frames of late have stamps before the last one and are skipped (~/reset)"
+        elif fleet is not None and fleet.problem:
+            level, text = DiagnosticStatus.WARN, fleet.sentence()
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
-        self.publish(level, text, self._values(rates, settings))
+        self.publish(level, text, self._values(rates, settings) | (fleet.values() if fleet is not None else {}))
 
     def _sentence(self, rates: tuple[float, float], settings: Settings) -> str:
         score = max(self._statistics.best_scores, default=None)

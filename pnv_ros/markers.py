@@ -53,17 +53,21 @@ class PoseTrack:
         self._positions.append((pose.position.x, pose.position.y, pose.position.z))
         self.frame_id = message.header.frame_id
 
+    def at(self, stamp_ns: int) -> tuple[float, float, float] | None:
+        """The position nearest to a stamp, if there is one within half a second."""
+        stamps = list(self._stamps)
+        if not stamps:
+            return None
+        at = bisect_left(stamps, stamp_ns)
+        near = min((i for i in (at - 1, at) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - stamp_ns))
+        return self._positions[near] if abs(stamps[near] - stamp_ns) <= _NEAR_NS else None
+
     def place(self, refs: Sequence[ImageRef]) -> dict[int, tuple[float, float, float]]:
         """Positions of the keyframes that have one; those of keyframes not in `refs` are forgotten."""
-        stamps = list(self._stamps)
         known = {r.id: self._keyframes[r.id] for r in refs if r.id in self._keyframes}
         for ref in refs:
-            if ref.id not in known and stamps:
-                at = bisect_left(stamps, ref.stamp_ns)
-                near = min((i for i in (at - 1, at) if 0 <= i < len(stamps)),
-                           key=lambda i: abs(stamps[i] - ref.stamp_ns))  # fmt: skip
-                if abs(stamps[near] - ref.stamp_ns) <= _NEAR_NS:
-                    known[ref.id] = self._positions[near]
+            if ref.id not in known and (position := self.at(ref.stamp_ns)) is not None:
+                known[ref.id] = position
         self._keyframes = known
         return known
 

@@ -26,6 +26,7 @@ from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
 from pnv_ros.diagnostics import Diagnostics
+from pnv_ros.fleet import start_fleet
 from pnv_ros.inputs import ImageInputs
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Parameters, Settings
@@ -176,7 +177,8 @@ class PlaceRecognizerNode(LifecycleNode):
         describer = describer_from(self.settings.recogniser)
         database = KeyframeDatabase.for_describer(describer, read_only=config.read_only)
         recognizer = PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
-        per_keyframe = database.bytes_per_keyframe(_warm_up(describer))
+        like = _warm_up(describer)
+        per_keyframe = database.bytes_per_keyframe(like)
         if per_keyframe > database.bytes_budget:
             raise ConfigError(
                 f"memory_budget_mb = {self.settings.recogniser.memory_budget_mb:g} holds no keyframe; "
@@ -200,6 +202,8 @@ class PlaceRecognizerNode(LifecycleNode):
         if config.autosave:
             self._autosave = self._map.autosave(config.autosave_interval_s, self._report_autosave)
             self._autosave.start()
+        if config.fleet_uri:
+            self._recognition.fleet = start_fleet(self, config, recognizer, like, outputs)
         self.get_logger().info(
             self._summary(describer, per_keyframe) + f"\n  configured   in {time.monotonic() - start:.1f} s"
         )
@@ -317,6 +321,8 @@ class PlaceRecognizerNode(LifecycleNode):
 
     def _free(self) -> None:
         if self._recognition is not None:
+            if self._recognition.fleet is not None:
+                self._recognition.fleet.close()
             self._recognition.outputs.close()
             for subscription in self._others:
                 self.destroy_subscription(subscription)

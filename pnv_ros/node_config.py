@@ -70,6 +70,29 @@ class NodeConfig:
     )
     frame_id: str = setting("map", "frame of ~/markers where poses name none", live=True)
 
+    # Fleet
+    fleet_uri: str = setting(
+        "", "places shared between robots: http(s)://HOST:PORT (Milvus) or a file NAME.db (Milvus Lite); empty = none"
+    )
+    fleet_robot: str = setting("", "this robot's name in the fleet; empty = the node's namespace, else the host's name")
+    fleet_budget_ms: float = setting(
+        500.0, "a keyframe the fleet could not be asked for in so long is asked for later", unit="ms", low=1.0, high=1e6
+    )
+    fleet_coverage: float = setting(
+        1.0,
+        "a keyframe is not sent where an accepted closure with the fleet is as similar as this; 1 = all are sent",
+        low=0.0,
+        high=1.0,
+    )
+    fleet_pictures: bool = setting(False, "send the small grey pictures; false sends their local features instead")
+    fleet_kb_s: float = setting(
+        0.0, "bound on what is sent, less what is received; 0 = none", unit="kB/s", low=0.0, high=1e6
+    )
+    fleet_outbox: str = setting("", "folder of what is not sent yet; empty = ~/.local/state/pnv_ros")
+    fleet_outbox_mb: float = setting(
+        1000.0, "bound on what is not sent yet; when full, the oldest goes", unit="MB", low=1.0, high=1e6
+    )
+
     def __post_init__(self) -> None:
         checked(self)
         topics = self.image_topics

@@ -76,6 +76,16 @@ class Outputs:
         if self.config.publish_match_image and self._match_image.get_subscription_count():
             self._match_image.publish(self._picture(frame, closures[0], picture_of(closures[0].match.id)))
 
+    def publish_fleet(self, closures: Sequence[LoopClosure]) -> None:
+        """The fleet's candidates for a query, best first, from a thread of its own; ~/lio_sam is for one robot only."""
+        accepted = [c for c in closures if c.accepted]
+        if accepted:
+            self._closures.publish(closures_to_message(accepted, self._cameras))
+            if self._typed is not None:
+                self._typed.publish(closures_to_typed(accepted))
+        if self.config.publish_candidates and self._candidates.get_subscription_count():
+            self._candidates.publish(candidates_to_message(closures, self._cameras, self.config.frame_id))
+
     def _publish_lio_sam(self, accepted: Sequence[LoopClosure]) -> None:
         """The best closure old enough for LIO-SAM, which takes no loops within its own window."""
         if not self.config.publish_lio_sam:

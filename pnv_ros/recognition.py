@@ -12,6 +12,7 @@ from pnv_core.config import live_settings
 from pnv_core.errors import ImageError
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, LoopClosure
+from pnv_fleet.fleet import Fleet
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Settings
 from pnv_ros.slot import WaitingFrame
@@ -37,6 +38,7 @@ class Recognition:
     ) -> None:
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
         self._statistics, self._stamps, self._log = statistics, stamps, log
+        self.fleet: Fleet | None = None
         self._session = 0
         self._wanted: Settings | None = None  # None: as configured
         self._taken: Settings | None = None
@@ -65,6 +67,8 @@ class Recognition:
     def map_was_replaced(self) -> None:
         """A map was loaded, which began a session. To be called while still."""
         self.recognizer.forget_the_past()
+        if self.fleet is not None:
+            self.fleet.sessions(self.recognizer.database.refs())
         self.outputs.new_session()
         self.outputs.markers.forget()
 
@@ -76,6 +80,8 @@ class Recognition:
                 self._taken = wanted
                 self.recognizer.change(**live_settings(wanted.recogniser))
                 self.outputs.config = wanted.node
+                if self.fleet is not None:
+                    self.fleet.change(self.recognizer.config)
             if waiting.session < self._session:  # waited here while another camera began a new session
                 self._statistics.drop(Drop.STAMP_BACK)
                 return
@@ -96,12 +102,21 @@ class Recognition:
                 count = self._statistics.drop(Drop.UNUSABLE)
                 self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
                 return
+            self._share()
             if closures:
                 with self.recognizer.timer.stage("publish"):
                     self.outputs.publish(frame, closures, self._picture_of)
         accepted = sum(c.accepted for c in closures)
         self._statistics.process(closures[0].score if closures else None, accepted, _in_words(closures))
         self._tell(closures, accepted)
+
+    def _share(self) -> None:
+        """Hand a keyframe, or the query of a map that takes none, to the fleet."""
+        query = self.recognizer.latest
+        if self.fleet is not None and query is not None:
+            first = self.recognizer.database.first()
+            oldest_ns = query.ref.stamp_ns if first is None else first.stamp_ns
+            self.fleet.offer(query, oldest_ns, self.outputs.markers.track.at(query.ref.stamp_ns))
 
     def _picture_of(self, keyframe: int) -> bytes:
         return self.recognizer.database.descriptor(keyframe).thumbnail

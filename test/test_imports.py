@@ -19,7 +19,7 @@ def test_every_import_follows_the_contract():
 
 
 def test_an_arrow_the_wrong_way_is_found(tmp_path):
-    for package in ("pnv_core", "pnv_lab", "msg_adapters", "pnv_ros", "pnv_cli"):
+    for package in ("pnv_core", "pnv_lab", "pnv_fleet", "msg_adapters", "pnv_ros", "pnv_cli"):
         (tmp_path / package).symlink_to(ROOT / package)
     (tmp_path / "pnv_core").unlink()
     (tmp_path / "pnv_core").mkdir()

@@ -389,6 +389,10 @@ class KeyframeDatabase:
             return later.id - earlier.id
         return bisect_left(sequence, later.id) - bisect_left(sequence, earlier.id)
 
+    def first(self) -> ImageRef | None:
+        """The keyframe of the lowest id, if any."""
+        return self._keyframes[self._ids[0]].ref if self._ids else None
+
     def last(self) -> ImageRef | None:
         """The keyframe added last, if any."""
         return self._keyframes[self._ids[-1]].ref if self._ids else None

@@ -53,6 +53,28 @@ def test_closures_survive_the_message(given_closures):
     assert closures_from_message(closures_to_message(given_closures, CAMERAS), CAMERAS) == given_closures
 
 
+def test_closures_between_robots_carry_two_columns_more_and_the_names():
+    ours, theirs = ImageRef(41, 10**9, "rear", 0, "alpha"), ImageRef(7, 2 * 10**9, "front", 0, "ns/beta-2")
+    between = LoopClosure(ours, theirs, 0.75, 0.5, 0.25, 60, True)
+    message = closures_to_message([between], CAMERAS)
+    columns = message.layout.dim[1]
+    assert columns.label.endswith(",query_camera,match_camera,query_robot,match_robot|alpha|ns/beta-2")
+    assert (columns.size, message.layout.dim[0].stride, list(message.data[12:])) == (14, 14, [0, 1])
+    assert closures_from_message(message, CAMERAS) == [between]
+    table = candidates_to_message([between], CAMERAS)
+    assert [f.name for f in table.fields][-2:] == ["query_robot", "match_robot|alpha|ns/beta-2"]
+    values = {f.name: int.from_bytes(bytes(table.data[f.offset : f.offset + 4]), "little") for f in table.fields[-2:]}
+    assert list(values.values()) == [0, 1]
+    assert table.point_step % 8 == 0
+
+
+def test_a_robot_index_beyond_the_names_names_nobody():
+    between = LoopClosure(ImageRef(1, 1, "rear", 0, "a"), ImageRef(2, 2, "rear", 0, "b"), 0.75, 0.5, 0.25, 60, True)
+    message = closures_to_message([between], CAMERAS)
+    message.data[13] = 1e6
+    assert closures_from_message(message, CAMERAS)[0].match.robot == ""
+
+
 @given(closures)
 def test_the_floor_of_the_first_two_columns_is_the_header_second(one):
     data = closures_to_message([one], CAMERAS).data

@@ -1,0 +1,420 @@
+"""Fleet: a robot's part in the fleet's memory. Recognition hands keyframes over and never waits."""
+
+import math
+import os
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+
+from pnv_core.config import Config
+from pnv_core.types import ImageRef, LoopClosure, PlaceDescriptor, Query
+from pnv_fleet.answers import Answers, of_robot
+from pnv_fleet.errors import FleetError
+from pnv_fleet.outbox import Outbox, Waiting
+from pnv_fleet.places import (
+    Place,
+    descriptor_of,
+    encode_view,
+    layouts_of,
+    parts_of,
+    robot_name,
+    row_bytes,
+    without_picture,
+)
+from pnv_fleet.store import Access, PlaceStore
+
+_MOST_OFFERED = 64  # keyframes in memory that the outbox has not taken yet
+_BATCH, _BATCH_BYTES = 16, 2_000_000
+_LONGEST_PAUSE_S = 30.0  # between tries of a store that fails
+_NICE = 10  # the fleet's threads give way to recognition
+_IDLE_S = 0.2
+_COUNTED = ("sent", "covered", "asked", "late", "closures", "refused", "bytes_sent", "bytes_received")
+_CLOSE_S = 1.0
+_TIMEOUT_S = 5.0  # of one call to the store
+
+
+@dataclass(frozen=True)
+class Options:
+    """A robot's part: see the settings `fleet_...` of the node."""
+
+    uri: str
+    robot: str
+    budget_ms: float
+    outbox: Path
+    outbox_mb: float
+    kb_s: float
+    coverage: float
+    pictures: bool
+
+
+@dataclass(frozen=True)
+class FleetStatus:
+    """What happened so far, and what is wrong since when (epoch seconds; empty where nothing is)."""
+
+    problem: str
+    since: float
+    waiting: int  # keyframes in the outbox
+    dropped: int  # keyframes given up, sent or not asked for
+    robots: dict[str, int]  # closures by the robot they are with
+    sent: int = 0
+    covered: int = 0  # keyframes not sent, since the fleet has their place
+    asked: int = 0
+    late: int = 0  # answers after the budget
+    closures: int = 0
+    refused: int = 0  # rows that were not believed
+    bytes_sent: int = 0
+    bytes_received: int = 0
+
+    def sentence(self) -> str:
+        """For people; empty where nothing is wrong."""
+        if not self.problem:
+            return ""
+        then = datetime.fromtimestamp(self.since, timezone.utc).strftime("%H:%M:%S UTC")
+        return f"fleet: {self.problem}, since {then}; {self.waiting} keyframes wait"
+
+    def values(self) -> dict[str, str]:
+        """By name, as /diagnostics shows them."""
+        return {
+            "fleet": self.sentence() or "no failure",
+            "fleet: keyframes sent": str(self.sent),
+            "fleet: keyframes waiting": str(self.waiting),
+            "fleet: keyframes dropped": str(self.dropped),
+            "fleet: keyframes covered": str(self.covered),
+            "fleet: queries": str(self.asked),
+            "fleet: late answers": str(self.late),
+            "fleet: rows refused": str(self.refused),
+            "fleet: closures": str(self.closures),
+            "fleet: closures by robot": ", ".join(f"{r} {n}" for r, n in sorted(self.robots.items())) or "none",
+            "fleet: sent [kB]": f"{self.bytes_sent / 1e3:.0f}",
+            "fleet: received [kB]": f"{self.bytes_received / 1e3:.0f}",
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A query on its way: the place it becomes, how it is asked, when it was handed over."""
+
+    query: Query
+    place: Place | None  # None for a query that is not shared
+    where: str
+    offered: float
+
+
+class Fleet:
+    """Threads that keep, ask and send. `closures` is called with the candidates of a query, `say` with log lines.
+
+    keep   keyframes handed over become places in the outbox
+    ask    the fleet is asked for each, in order; what has waited longer than the budget is left to send
+    send   places go to the store in batches; queries that were not answered in time are asked first
+
+    Raises FleetError for an outbox that cannot be used.
+    """
+
+    def __init__(
+        self,
+        options: Options,
+        config: Config,
+        fingerprint: str,
+        like: PlaceDescriptor,
+        calibration: dict | None,
+        closures: Callable[[list[LoopClosure]], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self.options = options
+        self._robot = robot_name(options.robot)
+        self._access = Access.from_environment()
+        self._fingerprint, self._config = fingerprint, config
+        self._like, self._parts = like, parts_of(layouts_of(like))
+        self._lanes = tuple(Answers(config, calibration, like) for _ in ("ask", "send"))
+        self._closures, self._say = closures, say
+        self._outbox = Outbox(options.outbox, options.outbox_mb)
+        self._store: PlaceStore | None = None
+        self._sessions: dict[int, int] = {}
+        self._offered: deque[tuple[Query, int, tuple[float, float, float] | None, float]] = deque()
+        self._fresh: deque[_Asked] = deque()
+        self._pending: set[str] = set()  # keys that `ask` will deal with
+        self._changed = threading.Condition()
+        self._connecting = threading.Lock()
+        self._ended = threading.Event()
+        self._troubles: dict[str, tuple[str, float]] = {}  # of "outbox" and "store": what, since when
+        self._pause_s = self._again = 0.0
+        self._counts: Counter[str] = Counter()
+        self._robots: Counter[str] = Counter()
+        self._owed = 0.0  # bytes beyond the limit
+        self._threads = [
+            threading.Thread(target=self._guarded(run), name=f"fleet {name}", daemon=True)
+            for name, run in (("keep", self._keep), ("ask", self._ask), ("send", self._send))
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    # What recognition calls; none of these waits
+
+    def offer(self, query: Query, oldest_ns: int, position: tuple[float, float, float] | None = None) -> None:
+        """A keyframe was made (or, with id -1, a query that is none).
+
+        `oldest_ns` is the stamp of the oldest keyframe that is known locally: younger ones of this robot are not asked
+        for. `position` is where it was taken, in metres, if that is known.
+        """
+        with self._changed:
+            self._offered.append((query, oldest_ns, position, time.monotonic()))
+            if len(self._offered) > _MOST_OFFERED:
+                self._offered.popleft()
+                self._counts["lost"] += 1
+            self._changed.notify_all()
+
+    def change(self, config: Config) -> None:
+        """Other live settings of the recogniser."""
+        self._config = config
+
+    def sessions(self, refs: Iterable[ImageRef]) -> None:
+        """A map was loaded: these keyframes are its sessions'."""
+        first: dict[int, int] = {}
+        for ref in refs:
+            first[ref.session] = min(ref.stamp_ns, first.get(ref.session, ref.stamp_ns))
+        self._sessions = first
+
+    def status(self) -> FleetStatus:
+        with self._changed:
+            troubles, counts, robots = dict(self._troubles), Counter(self._counts), dict(self._robots)
+        return FleetStatus(
+            problem="; ".join(text for text, _ in troubles.values()),
+            since=min((since for _, since in troubles.values()), default=0.0),
+            waiting=len(self._outbox),
+            dropped=counts["lost"] + self._outbox.dropped,
+            robots=robots,
+            **{name: counts[name] for name in _COUNTED},
+        )
+
+    def close(self) -> None:
+        """End the threads; what is not sent yet stays in the outbox."""
+        self._ended.set()
+        with self._changed:
+            self._changed.notify_all()
+        for thread in self._threads:  # one that waits for a silent store is left behind
+            thread.join(timeout=_CLOSE_S)
+        if self._store is not None:
+            with suppress(FleetError):
+                self._store.close()
+        self._outbox.close()
+
+    # keep
+
+    def _keep(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._offered or self._ended.is_set())
+                if not self._offered:
+                    return
+                item = self._offered.popleft()
+            self._take(*item)
+
+    def _take(self, query: Query, oldest_ns: int, position: tuple[float, float, float] | None, offered: float) -> None:
+        ref = query.ref
+        session = self._sessions.setdefault(ref.session, ref.stamp_ns)
+        seen = without_picture(query.descriptor, query.valid)
+        shared = None
+        if ref.id >= 0:
+            kept = query.descriptor if self.options.pictures else seen
+            shared = Place(
+                self._robot, session, ref.camera, ref.id, ref.stamp_ns, seen.texture, seen.global_vector,
+                encode_view(kept), position,
+            )  # fmt: skip
+            try:
+                self._outbox.add(shared, query.predecessor)
+                self._well("outbox")
+            except FleetError as error:
+                self._tally(lost=1)
+                self._trouble("outbox", str(error))
+                shared = None
+        asked = Query(ref, seen, query.predecessor)
+        with self._changed:
+            if shared is not None:
+                self._pending.add(shared.key)
+            self._fresh.append(
+                _Asked(of_robot(asked, self._robot, session), shared, self._where(ref.stamp_ns, oldest_ns), offered)
+            )
+            self._changed.notify_all()
+
+    def _where(self, stamp_ns: int, oldest_ns: int) -> str:
+        """Every place but this robot's own that are known locally or recent."""
+        recent = stamp_ns - int(self._config.exclude_recent_s * 1e9)
+        return f'robot != "{self._robot}" or stamp_ns < {max(0, min(oldest_ns, recent))}'
+
+    # ask
+
+    def _ask(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._fresh or self._ended.is_set())
+                if self._ended.is_set():
+                    return
+                asked = self._fresh.popleft()
+            try:
+                if (time.monotonic() - asked.offered) * 1e3 <= self.options.budget_ms:
+                    self._answer(self._lanes[0], asked)
+                else:
+                    self._lanes[0].forget()  # left to `send`: what follows it does not follow what was asked before it
+            except FleetError as error:
+                self._fail(str(error))
+            finally:
+                with self._changed:
+                    if asked.place is not None:
+                        self._pending.discard(asked.place.key)
+                    self._changed.notify_all()
+
+    def _answer(self, answers: Answers, asked: _Asked) -> bool:
+        """Ask and hand the answer on; False where the store is not to be tried yet. Raises FleetError."""
+        store = self._connected()
+        if store is None:
+            return False
+        answers.config = self._config
+        before = answers.received
+        found = answers.to(asked.query, store, asked.where)
+        accepted = [c for c in found if c.accepted]
+        late = (time.monotonic() - asked.offered) * 1e3 > self.options.budget_ms
+        more, refused = answers.received - before, len(answers.refused)
+        self._tally(asked=1, late=late, closures=len(accepted), refused=refused, bytes_received=more)
+        self._robots.update(c.match.robot for c in accepted)
+        self._owed += more
+        self._well("store")
+        for told in answers.refused:
+            self._say(f"refused {told}")
+        answers.refused.clear()
+        if found:
+            self._closures(found)
+        if asked.place is not None:
+            if self.options.coverage < 1.0 and any(c.similarity >= self.options.coverage for c in accepted):
+                self._tally(covered=1)
+                self._outbox.drop(asked.place.key)
+            else:
+                self._outbox.answered(asked.place.key)
+        return True
+
+    # send
+
+    def _send(self) -> None:
+        while not self._ended.is_set():
+            try:
+                busy = self._send_some()
+            except FleetError as error:
+                self._fail(str(error))
+                busy = False
+            if not busy:
+                with self._changed:
+                    self._changed.wait_for(self._ended.is_set, timeout=_IDLE_S)
+
+    def _send_some(self) -> bool:
+        """Whether there was something to send and it went."""
+        self._repay()
+        with self._changed:
+            pending = set(self._pending)
+        limit = _BATCH_BYTES if not self.options.kb_s else min(_BATCH_BYTES, int(self.options.kb_s * 1e3))
+        batch = self._outbox.oldest(_BATCH, limit, pending)
+        if not batch:
+            return False
+        store = self._connected()
+        if store is None:
+            return False
+        kept = self._answered(batch)
+        if kept:
+            store.put([w.place for w in kept])
+            self._outbox.remove([w.number for w in kept])
+            count = sum(row_bytes(w.place) for w in kept)
+            self._tally(sent=len(kept), bytes_sent=count)
+            self._owed += count
+            self._well("store")
+        return True
+
+    def _answered(self, batch: list[Waiting]) -> list[Waiting]:
+        """Those to send, once the fleet was asked what it was not asked in time."""
+        late = [w for w in batch if not w.asked]
+        for w in late:
+            place = w.place
+            query = Query(place.ref, descriptor_of(place, self._like), w.predecessor)
+            asked = _Asked(query, place, self._where(place.stamp_ns, place.session), -math.inf)
+            if self._ended.is_set() or not self._answer(self._lanes[1], asked):
+                return []
+        if not late:
+            return batch
+        now = {w.number: w for w in self._outbox.oldest(len(batch), 2 * _BATCH_BYTES, self._pending)}
+        return [now[w.number] for w in batch if w.number in now and now[w.number].asked]
+
+    def _repay(self) -> None:
+        """Wait until the limit allows to send again."""
+        if not self.options.kb_s:
+            self._owed = 0.0
+        while self._owed > 0 and not self._ended.is_set():
+            wait = min(0.5, self._owed / (self.options.kb_s * 1e3))
+            self._ended.wait(wait)
+            self._owed -= wait * self.options.kb_s * 1e3
+
+    # The store's state
+
+    def _connected(self) -> PlaceStore | None:
+        """The store; None while it is left alone after a failure. Raises FleetError where it cannot be opened."""
+        with self._connecting:
+            if time.monotonic() < self._again:
+                return None
+            if self._store is None:
+                timeout_s = max(_TIMEOUT_S, 4e-3 * self.options.budget_ms)
+                store = PlaceStore(
+                    self.options.uri,
+                    self._fingerprint,
+                    self._access,
+                    len(self._like.global_vector),
+                    self._parts,
+                    timeout_s,
+                )
+                self._say(f"fleet: {self.options.uri} ({store.version()}), collection {store.collection}")
+                if store.others:
+                    self._say(f"fleet: the store also holds {len(store.others)} other models, which cannot be compared")
+                self._store = store
+            return self._store
+
+    def _fail(self, problem: str) -> None:
+        """The store failed: it is left alone for a while, longer each time."""
+        self._trouble("store", problem)
+        with self._connecting:
+            self._pause_s = min(_LONGEST_PAUSE_S, max(1.0, 2 * self._pause_s))
+            self._again = time.monotonic() + self._pause_s
+            if self._store is not None:
+                with suppress(FleetError):
+                    self._store.close()
+            self._store = None
+
+    def _trouble(self, part: str, problem: str) -> None:
+        with self._changed:
+            before, since = self._troubles.get(part, ("", time.time()))
+            self._troubles[part] = problem, since
+        if problem != before:
+            self._say(f"fleet: {problem}")
+
+    def _well(self, part: str) -> None:
+        with self._changed:
+            trouble = self._troubles.pop(part, None)
+        if part == "store":
+            self._pause_s = self._again = 0.0
+        if trouble is not None:
+            self._say(f"fleet: the {part} is well again, after {time.time() - trouble[1]:.0f} s")
+
+    def _tally(self, **more: int) -> None:
+        with self._changed:
+            self._counts.update(more)
+
+    def _guarded(self, run: Callable[[], None]) -> Callable[[], None]:
+        def guarded() -> None:
+            with suppress(OSError):  # where threads have no priority of their own
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+            try:
+                run()
+            except Exception as error:  # a defect: local recognition goes on, and it is said
+                self._fail(f"ended by {type(error).__name__}: {error}")
+                raise
+
+        return guarded

@@ -1,0 +1,216 @@
+"""A robot's part in the fleet: real threads, a real store, stores that are slow, silent, gone and back."""
+
+import socket
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_fleet.errors import FleetError
+from pnv_fleet.fleet import Fleet, Options
+from pnv_fleet.places import layouts_of, parts_of
+from pnv_fleet.store import Access, PlaceStore
+from test.core.small import noise_image, small_describer
+from test.fleet.worlds import new_model
+from test.ros.camera import scene
+from test.ros.processes import wait_until
+
+pytest.importorskip("pymilvus", reason="the extra `fleet` is not installed")
+
+SECOND = 10**9
+SETTINGS = {"min_interval_s": 0.0, "min_change": 0.0, "consistency": 0, "exclude_recent_s": 30.0}
+
+
+class Robot:
+    """A recogniser whose keyframes go to a fleet."""
+
+    def __init__(self, tmp_path, name, uri, model="", start_s=1000, **options):
+        self.describer = small_describer(**SETTINGS)
+        self.recognizer = PlaceRecognizer(self.describer)
+        self.model = model or new_model()
+        self.answers, self.lines, self.stamp = [], [], start_s * SECOND
+        self.like = self.describer.describe(noise_image(0))
+        given = Options(uri, name, 5000.0, tmp_path / f"{name}.outbox", 100.0, 0.0, 1.0, False)
+        self.fleet = Fleet(
+            replace(given, **options), self.describer.config, self.model, self.like, None, self.answers.append,
+            self.lines.append,
+        )  # fmt: skip
+
+    def see(self, *scenes: int) -> list:
+        """Frames a second apart; the candidates of each, found locally."""
+        found = []
+        for number in scenes:
+            self.stamp += SECOND
+            from pnv_core.types import Frame
+
+            found.append(self.recognizer.process(Frame(self.stamp, "front", scene(number))))
+            self.fleet.offer(self.recognizer.latest, self.recognizer.database.first().stamp_ns)
+        return found
+
+    def settled(self) -> None:
+        wait_until(lambda: self.status.waiting == 0 and self.status.sent + self.status.covered > 0, 60, "the outbox")
+
+    @property
+    def status(self):
+        return self.fleet.status()
+
+    @property
+    def accepted(self) -> list:
+        return [c for answer in self.answers for c in answer if c.accepted]
+
+    def store(self, uri) -> PlaceStore:
+        return PlaceStore(uri, self.model, Access(), len(self.like.global_vector), parts_of(layouts_of(self.like)))
+
+
+def test_a_robot_recognises_where_another_one_was(server, tmp_path):
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(*range(8))
+    alpha.settled()
+    assert alpha.accepted == []
+    beta = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=5000)
+    beta.see(100, 5, 101, 2)
+    beta.settled()
+    closures = {(c.query.stamp_ns // SECOND, c.match.stamp_ns // SECOND) for c in beta.accepted}
+    assert closures == {(5002, 1006), (5004, 1003)}
+    assert {(c.query.robot, c.match.robot) for c in beta.accepted} == {("beta", "alpha")}
+    assert beta.status.robots == {"alpha": 2}
+    assert beta.store(server.uri).count() == 12
+    assert beta.status.bytes_sent > 0
+    for robot in (alpha, beta):
+        robot.fleet.close()
+
+
+def test_a_robot_finds_its_own_earlier_days_but_not_what_it_knows_itself(server, tmp_path):
+    day = Robot(tmp_path, "alpha", server.uri)
+    day.see(1, 2, 3, 1)
+    day.settled()
+    assert day.accepted == []
+    day.fleet.close()
+    next_day = Robot(tmp_path, "alpha", server.uri, day.model, start_s=90_000)
+    next_day.see(3)
+    next_day.settled()
+    assert [c.match.stamp_ns // SECOND for c in next_day.accepted] == [1003]
+    next_day.fleet.close()
+
+
+def test_a_store_that_is_away_loses_nothing_and_its_answers_come_late(server, tmp_path):
+    away = socket.create_server(("127.0.0.1", 0))
+    port = away.getsockname()[1]
+    away.close()
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(*range(4))
+    alpha.settled()
+    alpha.fleet.close()
+    beta = Robot(tmp_path, "beta", f"http://127.0.0.1:{port}", alpha.model, start_s=5000, budget_ms=300.0)
+    start = time.monotonic()
+    local = beta.see(2, 50, 3)
+    assert time.monotonic() - start < 3.0
+    wait_until(lambda: beta.status.problem and beta.status.waiting == 3, 30, "a problem")
+    assert "cannot be reached" in beta.status.sentence()
+    assert "since" in beta.status.sentence()
+    beta.fleet.close()
+    alone = Robot(tmp_path, "alone", f"http://127.0.0.1:{port}", start_s=5000)
+    assert [[(c.match, c.score) for c in one] for one in alone.see(2, 50, 3)] == [
+        [(c.match, c.score) for c in one] for one in local
+    ]
+    alone.fleet.close()
+    back = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=9000)  # the same outbox: nothing was lost
+    back.settled()
+    assert {(c.query.stamp_ns // SECOND, c.match.stamp_ns // SECOND) for c in back.accepted} == {
+        (5001, 1003), (5003, 1004),
+    }  # fmt: skip
+    assert back.status.late == 3
+    assert back.store(server.uri).count() == 7
+    back.fleet.close()
+
+
+def test_the_recogniser_never_waits_for_a_store_that_never_answers(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        robot = Robot(tmp_path, "alpha", f"http://127.0.0.1:{silent.getsockname()[1]}")
+        robot.see(*range(3))
+        query = robot.recognizer.latest
+        start = time.monotonic()
+        for _ in range(50):
+            robot.fleet.offer(query, 0)
+        assert time.monotonic() - start < 0.5
+        wait_until(lambda: robot.status.waiting >= 3, 10, "the outbox")
+        robot.fleet.close()
+
+
+def test_what_the_fleet_has_is_not_sent_again(server, tmp_path):
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(*range(4))
+    alpha.settled()
+    beta = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=5000, coverage=0.95)
+    beta.see(1, 60, 2)
+    beta.settled()
+    wait_until(lambda: beta.status.covered == 2, 20, "two covered")
+    assert beta.store(server.uri).count() == 5
+    for robot in (alpha, beta):
+        robot.fleet.close()
+
+
+def test_no_more_is_sent_than_the_limit_allows(server, tmp_path):
+    robot = Robot(tmp_path, "alpha", server.uri, kb_s=100.0)
+    start = time.monotonic()
+    robot.see(*range(12))
+    robot.settled()
+    took, one = time.monotonic() - start, robot.status.bytes_sent / 12
+    assert robot.status.bytes_sent <= 100e3 * took + 16 * one  # the first batch is not waited for
+    robot.fleet.close()
+
+
+def test_a_query_that_is_no_keyframe_is_asked_and_not_stored(server, tmp_path):
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(*range(3))
+    alpha.settled()
+    beta = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=5000)
+    beta.recognizer.database.read_only = True
+    from pnv_core.types import Frame
+
+    beta.recognizer.process(Frame(5000 * SECOND, "front", scene(1)))
+    beta.fleet.offer(beta.recognizer.latest, 5000 * SECOND)
+    wait_until(lambda: beta.accepted, 20, "a closure")
+    assert beta.accepted[0].query.id == -1
+    assert (beta.status.waiting, beta.store(server.uri).count()) == (0, 3)
+    for robot in (alpha, beta):
+        robot.fleet.close()
+
+
+def test_pictures_travel_only_where_they_are_asked_for(server, tmp_path):
+    for pictures in (False, True):
+        robot = Robot(tmp_path, f"r{pictures}", server.uri, pictures=pictures)
+        robot.see(1)
+        robot.settled()
+        (place,) = robot.store(server.uri).scan(views=True)
+        assert (b"\xff\xd8\xff" in place.view) == pictures
+        assert (b"PNVF" in place.view) != pictures
+        robot.fleet.close()
+
+
+def test_places_of_other_models_are_told(server, tmp_path):
+    Robot(tmp_path, "alpha", server.uri).see(1)
+    other = Robot(tmp_path, "other", server.uri)
+    other.see(1)
+    other.settled()
+    assert any("other models" in line for line in other.lines)
+    other.fleet.close()
+
+
+def test_a_second_node_of_the_same_name_is_refused(tmp_path):
+    first = Robot(tmp_path, "alpha", "http://127.0.0.1:1")
+    with pytest.raises(FleetError, match="held by another process"):
+        Robot(tmp_path, "alpha", "http://127.0.0.1:1")
+    first.fleet.close()
+
+
+def test_vectors_are_kept_as_they_were(server, tmp_path):
+    robot = Robot(tmp_path, "alpha", server.uri)
+    robot.see(4)
+    vector = robot.recognizer.latest.descriptor.global_vector
+    robot.settled()
+    (place,) = robot.store(server.uri).scan(views=True)
+    np.testing.assert_allclose(place.vector, vector, atol=1e-6)
+    robot.fleet.close()
