@@ -60,10 +60,12 @@ DEVELOPMENT = [
 ]
 
 SLAM = [
-    "gtsam>=4.2",  # examples/pose_graph
+    "gtsam>=4.2",  # tf_bridge
     "evo>=1.28",
     "matplotlib>=3.8",
 ]
+
+BRIDGES = ("tf_bridge",)
 
 setup(
     name=PACKAGE,
@@ -95,6 +97,7 @@ setup(
     entry_points={
         "console_scripts": [
             "place_recognizer = pnv_ros.place_recognizer:main",
+            *(f"{name} = pnv_ros.bridges.{name}:main" for name in BRIDGES),
             "pnv = pnv_cli.main:main",
         ]
     },

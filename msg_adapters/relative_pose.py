@@ -1,8 +1,13 @@
 """A metric relative pose as a message."""
 
+from typing import Any
+
+import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from numpy.typing import NDArray
 
 from msg_adapters.loop_closures import to_time
+from msg_adapters.poses import matrix_of_pose
 from pnv_core.errors import PnvError
 from pnv_core.pose.geometry import RelativePose
 from pnv_core.types import LoopClosure
@@ -23,3 +28,14 @@ def relative_pose_to_message(closure: LoopClosure, pose: RelativePose) -> PoseWi
     orientation.x, orientation.y, orientation.z, orientation.w = (float(v) for v in pose.quaternion)
     message.pose.covariance = [float(v) for v in pose.covariance.ravel()]
     return message
+
+
+def relative_pose_from_message(message: Any) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
+    """Id of the match, the query's camera (4, 4) in the match's, covariance (6, 6) with position first.
+
+    Raises PnvError for a frame that names no keyframe.
+    """
+    name, _, number = message.header.frame_id.rpartition("_")
+    if name != "keyframe" or not number.isdigit():
+        raise PnvError(f"relative pose in the frame {message.header.frame_id!r}; allowed: keyframe_<id of the match>")
+    return int(number), matrix_of_pose(message.pose.pose), np.reshape(message.pose.covariance, (6, 6)).copy()

@@ -97,6 +97,15 @@ def graph_to_g2o(
     return "\n".join(lines) + "\n"
 
 
+def pose_graph_to_g2o(poses: Array, edges: Sequence[tuple[int, int, Array, Array]]) -> str:
+    """Poses (n, 4, 4) by number, and edges (from, to, relative (4, 4), information (6, 6) with position first)."""
+    lines = [
+        f"VERTEX_SE3:QUAT {i} {_numbers(p[:3, 3])} {_numbers(_quaternion(p[:3, :3]))}" for i, p in enumerate(poses)
+    ]
+    lines += [_edge(a, b, step[:3, 3], _quaternion(step[:3, :3]), information) for a, b, step, information in edges]
+    return "".join(line + "\n" for line in lines)
+
+
 def _edge(a: int, b: int, position: Array, quaternion: Array, information: Array) -> str:
     # g2o's rotation error is the vector part of the quaternion, half the angle: its information is four times as large
     scale = np.array([1, 1, 1, 2, 2, 2])
