@@ -4,6 +4,7 @@
 # make slam-demo a pose graph closed by the node
 # make test      every test
 # make bench     the benchmarks
+# make docs      the documentation as a site in out/site, every link checked
 # make lint      ruff and mypy
 
 PYTHON ?= python3
@@ -16,7 +17,7 @@ TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
-.PHONY: install shell demo slam-demo test bench lint clean
+.PHONY: install shell demo slam-demo test bench docs lint clean
 
 install: $(READY) $(MESSAGES)
 
@@ -55,6 +56,10 @@ test: $(READY)
 
 bench: $(READY)
 	@$(BIN)/python -m benchmarks.run
+
+docs: $(READY)
+	@$(BIN)/python -c "import material" 2>/dev/null || $(BIN)/pip install --progress-bar off -q -e ".[docs]"
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet && echo "out/site/index.html"
 
 lint: $(READY)
 	@$(BIN)/ruff check .

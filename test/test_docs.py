@@ -23,7 +23,20 @@ from test.lab.evaluation.places import place, write
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-ELSEWHERE = ("make", "ros2", "git", "pip", "cd", "source", "sudo", "docker", "place_recognizer", "chromium")
+ELSEWHERE = (
+    "make",
+    "ros2",
+    "git",
+    "pip",
+    "cd",
+    "source",
+    "sudo",
+    "docker",
+    "place_recognizer",
+    "chromium",
+    "python",
+    "python3",
+)
 NEEDS_NETWORK = ("pnv weights fetch", "pnv doctor")  # the doctor also needs a middleware of its own; tested elsewhere
 BLOCK = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.M | re.S)
 
