@@ -17,7 +17,8 @@ from pnv_core.types import Frame
 from pnv_lab.worlds.sequences import loop_sequence
 
 FIT = ("icl", "ikuta", "walks", "world_corridor", "tower")
-JUDGE = ("donkey", "pepper", "kitti03", "multifloor", "gardens", "essex", "webcams", "panoramas")
+JUDGE = ("donkey", "pepper", "kitti03", "multifloor", "tower", "viewpoint", "gardens", "essex", "webcams", "panoramas")
+NARROW = ("donkey", "pepper", "gardens")  # ground truth that knows fewer true pairs than there are
 TRUE, FALSE, IGNORE = 1, 0, -1
 
 Truth = Callable[[int, int], int]
@@ -177,6 +178,13 @@ def _essex(shared: Path) -> TruthSequence:
     return _paired("essex", shared / "data/essex3in1_thumbs", ("ref", "query"), lambda q, r: int(int(q) == int(r)))
 
 
+def _viewpoint(shared: Path) -> TruthSequence:
+    folder = shared / "data/viewpoint_places"
+    true = {Path(r["query"]).stem: {Path(ref).stem for ref in r["true_refs"].split(";")}
+            for r in _rows(folder / "matches.csv")}  # fmt: skip
+    return _paired("viewpoint", folder, ("ref", "query"), lambda q, r: int(r in true.get(q, ())))
+
+
 def _webcams(shared: Path) -> TruthSequence:
     def same(q: str, r: str) -> int:
         return int(q.split("_")[0] == r.split("_")[0])
@@ -268,5 +276,5 @@ def _world(name: str) -> TruthSequence:
 _LOADERS: dict[str, Callable[[Path], TruthSequence]] = {
     "icl": _icl, "ikuta": _ikuta, "walks": _walks, "tower": _tower, "panoramas": _panoramas, "donkey": _donkey,
     "pepper": _pepper, "kitti03": _kitti03, "multifloor": _multifloor, "gardens": _gardens, "essex": _essex,
-    "webcams": _webcams,
+    "webcams": _webcams, "viewpoint": _viewpoint,
 }  # fmt: skip

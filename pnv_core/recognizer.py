@@ -6,9 +6,9 @@ from typing import Any
 from pnv_core.config import live_settings
 from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
-from pnv_core.decide.consistency import SequenceMemory, window_of
+from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
 from pnv_core.decide.gates import decided
-from pnv_core.decide.judge import Judge
+from pnv_core.decide.judge import Judge, rank
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
@@ -75,8 +75,8 @@ class PlaceRecognizer:
             self.odometry.remember(query)
         self.latest = Query(query, descriptor, predecessor, frame.valid)
         closures = [replace(c, query=query) for c in closures]
-        self.sequence.remember(frame.camera, closures, window_of(self.config.consistency))
-        return [self._decided(c) for c in closures]
+        self.sequence.remember(frame.camera, closures, window_of(self.config.consistency + DOUBT))
+        return sorted(map(self._decided, closures), key=rank)
 
     def change(self, **live: Any) -> None:
         """Take these live settings from the next frame on. Raises ConfigError for others and for a wrong value."""

@@ -134,6 +134,7 @@ class Reason(StrEnum):
     ODOMETRY = "odometry"
     NOT_RERANKED = "not_reranked"
     NOT_VERIFIED = "not_verified"
+    AMBIGUOUS = "ambiguous"
 
 
 @dataclass(frozen=True)
@@ -155,6 +156,7 @@ class Evidence:
     texture: float = 1.0  # the lesser of both images, in [0, 1]
     local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined
     local_spread: float = 0.0  # of those
+    rival_inliers: int = 0  # local features of the best examined candidate elsewhere
 
 
 @dataclass(frozen=True)

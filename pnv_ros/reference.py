@@ -25,6 +25,7 @@ REASONS = {
     Reason.ODOMETRY: "the jump is impossible by odometry",
     Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms",
     Reason.NOT_VERIFIED: "not among the best that local features examined (verify)",
+    Reason.AMBIGUOUS: "a place far from the match is supported about alike, and too few keyframes agree yet",
 }
 DROPS = {
     Drop.BUSY: "a newer frame of the camera came before the worker was free",

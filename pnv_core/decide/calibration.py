@@ -23,7 +23,7 @@ from pnv_core.types import Evidence
 
 Array = NDArray[np.float64]
 
-_CHANCE = 8  # as many local features agree on some epipolar geometry by chance
+CHANCE = 8  # as many local features agree on some epipolar geometry by chance
 _LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
 
 # Every feature grows with the belief in the candidate. Similarity and the leads are left out where local features
@@ -41,7 +41,7 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
     "verified": {
         "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
         "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
-        "local_inliers": lambda e: math.log(max(e.local_inliers, _CHANCE) / _CHANCE),
+        "local_inliers": lambda e: math.log(max(e.local_inliers, CHANCE) / CHANCE),
         "local_spread": lambda e: e.local_spread,
     },
 }

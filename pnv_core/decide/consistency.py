@@ -1,9 +1,11 @@
-"""Agreement in time: a loop is believed when the keyframes before the query matched neighbours of its match, in order.
+"""Belief over time: what the keyframes before a query say of its match.
 
-In the spirit of SeqSLAM (Milford and Wyeth, ICRA 2012): a robot that is back at a place sees a sequence of places
-again, forwards or backwards, at some other speed; a chance resemblance stands alone.
+In the spirit of SeqSLAM (Milford and Wyeth, ICRA 2012) and of the Bayes filters of FAB-MAP and RTAB-Map: a robot that
+is back at a place sees a sequence of places again, forwards or backwards, at some other speed; a chance resemblance
+stands alone. Weak evidence that agrees over several frames becomes a closure, strong evidence that stands alone waits.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,18 +17,22 @@ Steps = Callable[[ImageRef, ImageRef], int]  # keyframes from one to a later one
 _STEP = 6  # keyframes of the other visit that may pass per keyframe of this one
 _MISSES = 2  # queries in the window that may lack a match on the path: a person in the way, a blurred image
 _FLOOR = 0.05  # a candidate below this score supports nothing
+PRIOR = 0.12  # P(same place) of a candidate on a path before its own frame is looked at; less speaks against it
+_WEIGHT = 0.35  # what the evidence of one frame counts: neighbouring frames err together
+_MISS = -0.7  # log odds, of a query without a match on the path
+_MOST = 3.0  # log odds, of one frame: a blurred image proves as little as a lucky one
+DOUBT = 4  # more keyframes must agree where a place elsewhere is supported alike: look-alike rooms are left sooner
 
 
 @dataclass(frozen=True)
 class Path:
     """Matches of successive queries that follow one another in the other visit.
 
-    `length` counts the queries with a match on the path, `score` is the mean of the matches' scores over the window,
-    a query without one counting 0.
+    `length` counts the queries with a match on the path; `belief` is P(same place) after all of them.
     """
 
     length: int
-    score: float
+    belief: float
     direction: int  # +1 the way was taken in the same direction, -1 backwards, 0 not yet known
 
 
@@ -54,30 +60,45 @@ class SequenceMemory:
     def path(self, closure: LoopClosure, window: int) -> Path:
         """The best path that ends at a closure, over this query (remembered last) and the `window` - 1 before it."""
         earlier = list(self._queries.get(closure.query.camera, ()))[:-1][-(window - 1) :] if window > 1 else []
-        return max(
-            (self._followed(closure, earlier, way, window) for way in (1, -1)), key=lambda p: (p.length, p.score)
-        )
+        return max((self._followed(closure, earlier, way) for way in (1, -1)), key=lambda p: (p.length, p.belief))
 
-    def _followed(self, closure: LoopClosure, earlier: list[tuple[LoopClosure, ...]], way: int, window: int) -> Path:
+    def _followed(self, closure: LoopClosure, earlier: list[tuple[LoopClosure, ...]], way: int) -> Path:
         """Backwards through the queries: of the matches in order and reach, take the best; a query may be missed."""
-        at, length, total, steps, moved = closure.match, 1, closure.score, 1, False
+        at, length, steps, moved = closure.match, 1, 1, False
+        total, here = 0.0, _evidence(closure.score)  # the same picture again is one witness, heard at its best
         for candidates in reversed(earlier):
             following = [c for c in candidates if self._follows(c.match, at, way, steps)]
             if not following:
                 steps += 1
+                total += _MISS
                 continue
             best = max(following, key=lambda c: (c.score, c.match.id != at.id, -abs(self._steps(c.match, at))))
-            moved = moved or best.match.id != at.id
-            at, steps = best.match, 1
-            length, total = length + 1, total + best.score
-        if not moved and length > 1:
-            length = 1  # the other visit stood still: the same picture again and again is one witness, not many
-        return Path(length, total / window, way if moved else 0)
+            if best.match.id == at.id:
+                here = max(here, _evidence(best.score))
+            else:
+                total, here, moved = total + here, _evidence(best.score), True
+            at, length, steps = best.match, length + 1, 1
+        if not moved:  # the other visit stood still
+            length, total, here = 1, 0.0, _evidence(closure.score)
+        return Path(length, _probability(_log_odds(PRIOR) + _WEIGHT * (total + here)), way if moved else 0)
 
     def _follows(self, earlier: ImageRef, later: ImageRef, way: int, queries: int) -> bool:
         """Whether `earlier` may be matched by the query `queries` before the one that matched `later`."""
         same = (earlier.robot, earlier.session, earlier.camera) == (later.robot, later.session, later.camera)
         return same and 0 <= way * self._steps(earlier, later) <= _STEP * queries
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(max(probability, 1e-6) / max(1.0 - probability, 1e-6))
+
+
+def _probability(log_odds: float) -> float:
+    return 1.0 / (1.0 + math.exp(-log_odds))
+
+
+def _evidence(score: float) -> float:
+    """How far the log odds of a frame's score are from what was to be expected, bounded."""
+    return max(-_MOST, min(_MOST, _log_odds(score) - _log_odds(PRIOR)))
 
 
 def by_id(earlier: ImageRef, later: ImageRef) -> int:

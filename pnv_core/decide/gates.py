@@ -3,27 +3,47 @@
 from dataclasses import replace
 
 from pnv_core.config import Config
-from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
+from pnv_core.decide.calibration import CHANCE
+from pnv_core.decide.consistency import DOUBT, PRIOR, SequenceMemory, confirmed, window_of
 from pnv_core.types import Evidence, LoopClosure, Reason
+
+_ALIKE = 0.4  # of the match's own support
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
     """The judged closure, accepted or refused with a reason.
 
-    `sequence` remembers this query last; `impossible` is odometry's word, where there is any between both images.
+    The score of an accepted one is P(same place) with the keyframes before it. `sequence` remembers this query last;
+    `impossible` is odometry's word, where there is any between both images.
     """
     if closure.reason is Reason.NOT_RERANKED:
         return closure
     evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
     if evidence.texture < config.min_texture:
         return replace(closure, reason=Reason.LOW_TEXTURE)
-    if closure.score < config.accept_score:
+    wanted = config.consistency
+    path = sequence.path(closure, window_of(wanted))
+    agreed = confirmed(path, wanted) and closure.score >= PRIOR
+    belief = max(closure.score, path.belief) if agreed else closure.score
+    if belief < config.accept_score:
         return replace(closure, reason=Reason.LOW_SCORE)
     if config.verify and evidence.local_inliers < 0:
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)
-    path = sequence.path(closure, window_of(config.consistency))
-    if closure.score < config.sure_score and not confirmed(path, config.consistency):
+    if not agreed and closure.score < config.sure_score:
         return replace(closure, reason=Reason.UNCONFIRMED)
-    return replace(closure, accepted=True)
+    if wanted > 1 and ambiguous(evidence):
+        longer = sequence.path(closure, window_of(wanted + DOUBT))
+        if not confirmed(longer, wanted + DOUBT):
+            return replace(closure, reason=Reason.AMBIGUOUS)
+    return replace(closure, score=belief, accepted=True)
+
+
+def ambiguous(evidence: Evidence) -> bool:
+    """Whether this look occurs elsewhere: a place far from the match in the sequence is supported about alike.
+
+    On laps the rival may be the same place on another lap, so doubt asks for more keyframes that agree rather than
+    refusing for good; look-alike rooms (Doppelgangers: Cai et al., ICCV 2023) are left before they agree that long.
+    """
+    return evidence.rival_inliers > CHANCE and evidence.rival_inliers >= _ALIKE * evidence.local_inliers

@@ -59,7 +59,7 @@ class Judge:
                 texture=min(descriptor.texture, reference.texture),
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
-        found.sort(key=lambda pair: _rank(pair[0]))
+        found.sort(key=lambda pair: rank(pair[0]))
         if descriptor.thumbnail and config.verify:
             pictures = [(references[i].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
             shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
@@ -74,11 +74,28 @@ class Judge:
         # what ranked lower and was not examined is not believed more than what was
         most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
         closures = [c if e.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c, e, _ in found]
+        closures = [self._beside_rivals(c, closures) for c in closures]
         rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
-        return sorted(closures + rest, key=_rank)
+        return sorted(closures + rest, key=rank)
 
     def _apart(self, a: ImageRef, b: ImageRef) -> bool:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
+
+    def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:
+        """With the most support that any other place of the match's own sequence has."""
+        there, evidence = closure.match, closure.evidence
+        assert evidence is not None
+        most = max(
+            (
+                c.evidence.local_inliers
+                for c in all_of_query
+                if c.evidence is not None
+                and (c.match.robot, c.match.session) == (there.robot, there.session)
+                and self._apart(c.match, there)
+            ),
+            default=0,
+        )
+        return replace(closure, evidence=replace(evidence, rival_inliers=max(most, 0)))
 
     def _closure(
         self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float
@@ -95,7 +112,8 @@ def _not_reranked(query: ImageRef, match: ImageRef, similarity: float, texture: 
     return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
 
 
-def _rank(closure: LoopClosure) -> tuple[float, float, int]:
+def rank(closure: LoopClosure) -> tuple[float, float, int]:
+    """Sorts closures of a query best first."""
     return -closure.score, -closure.similarity, closure.match.id
 
 

@@ -92,7 +92,7 @@ def test_a_path_is_never_longer_than_its_window_and_never_counts_a_query_twice(f
         for c in closures:
             path = memory.path(c, window_of(wanted))
             assert 1 <= path.length <= window_of(wanted)
-            assert 0 <= path.score <= 1
+            assert 0 <= path.belief <= 1
 
 
 def test_chance_matches_are_hardly_ever_confirmed():
@@ -148,3 +148,29 @@ def test_elsewhere_is_counted_in_the_sequence_of_a_camera():
     assert database.steps(refs[0], refs[5 * 8]) == 5
     assert database.steps(refs[0], refs[5 * 8 + 3]) in (5, 6)
     assert database.steps(refs[20 * 8], refs[0]) == -20
+
+
+def test_weak_evidence_that_agrees_becomes_belief_and_alone_it_does_not():
+    window = window_of(5)
+    alone, agreed = ([[(10 + i, 0.4)] if i in frames else [] for i in range(7)] for frames in ({6}, {2, 3, 4, 5, 6}))
+    beliefs = []
+    for found in (alone, agreed):
+        memory = SequenceMemory()
+        for query, matches in enumerate(found, start=1000):
+            closures = [closure(query, m, s) for m, s in matches]
+            memory.remember("front", closures, window)
+        beliefs.append(memory.path(closures[0], window).belief)
+    assert beliefs[0] < 0.3
+    assert beliefs[1] > 0.5
+
+
+@given(st.lists(st.floats(0.06, 0.94), min_size=5, max_size=5), st.integers(0, 4))
+def test_a_better_score_anywhere_on_a_way_never_lowers_the_belief(scores, better):
+    beliefs = []
+    for raised in (0.0, 0.05):
+        memory = SequenceMemory()
+        for i, score in enumerate(scores):
+            last = closure(1000 + i, 10 + i, score + (raised if i == better else 0.0))
+            memory.remember("front", [last], window_of(5))
+        beliefs.append(memory.path(last, window_of(5)).belief)
+    assert beliefs[1] >= beliefs[0]
