@@ -11,6 +11,7 @@ from pnv_core.errors import PnvError
 
 COMMANDS = {
     "run": "loop closures of a folder of images, a video or a bag, with a report",
+    "bag": "what the node would publish of a bag, as a bag to play beside it",
     "match": "do two images show the same place?",
     "map": "inspect, check, merge, thin out, recover and export saved maps",
     "doctor": "check this machine, and say what to do",
