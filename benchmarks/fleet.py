@@ -1,10 +1,9 @@
-"""The fleet's memory, measured: python -m benchmarks.fleet scale | kills | cut | latency | views
+"""The fleet's memory, measured: python -m benchmarks.fleet scale | kills | cut
 
 scale     insert rate, query latency, recall@10 against exact search, at so many keyframes (--sizes)
-kills     node and store killed at random moments (--kills): nothing acknowledged is lost, nothing is stored twice
-cut       the store is away for a while (--seconds): local closures as without a fleet, the outbox drained after
-latency   time of a frame with and without a fleet, interleaved
-views     what the parts of a keyframe take, and what search costs beside them
+kills     robot and store killed at random moments (--kills): nothing acknowledged is lost, nothing is stored twice
+cut       the store is away for a while (--seconds) in a walk: local closures and time of a frame as without a fleet,
+          the outbox drained after
 """
 
 import argparse
@@ -21,6 +20,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pnv_core.config import Config
+from pnv_core.types import ImageRef, PatchGrid, PlaceDescriptor, Query
 
 Array = NDArray[np.float32]
 _DIM = 512  # of the default model's global vector
@@ -163,15 +165,148 @@ def scale(sizes: list[int], queries: int) -> None:
             )
 
 
+def _like() -> PlaceDescriptor:
+    return _seen(0)
+
+
+def _seen(number: int) -> PlaceDescriptor:
+    rng = np.random.default_rng(number)
+    rows = rng.standard_normal((13, 32)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    return PlaceDescriptor(rows[0], (PatchGrid(2, 3, 4, rows[1:]),), 0.5)
+
+
+def robot(uri: str, folder: Path) -> None:
+    """Keeps a keyframe every 10 ms and prints its number once it is in the outbox; until it is killed."""
+    from pnv_fleet.fleet import Fleet, Options
+
+    config = Config.make(patch_sizes=(2,), patch_strides=(1,), patch_weights=(1.0,), verify=0, scorer="rapid")
+    options = Options(uri, "robot", 200.0, folder / "outbox", 100.0, 0.0, 1.0, False)
+    fleet = Fleet(options, config, "7" * 64, _like(), None, lambda closures: None, lambda line: None)
+    number = int((folder / "next").read_text()) if (folder / "next").exists() else 0
+    while True:
+        query = Query(ImageRef(number, (number + 1) * 10**9, "camera"), _seen(number), 1.0)
+        fleet._take(query, 0, None, time.monotonic())
+        print(number, flush=True)
+        number += 1
+        time.sleep(0.01)
+
+
+def kills(count: int) -> int:
+    """0 where nothing was lost or doubled."""
+    from pnv_fleet.outbox import Outbox
+    from pnv_fleet.store import Access, PlaceStore
+
+    rng = np.random.default_rng(0)
+    kept: set[int] = set()
+    with served() as server:
+        folder = server.folder.parent
+        out = folder / "printed"
+        child: subprocess.Popen | None = None
+        for kill in range(count):
+            if child is None:
+                kept |= _printed(out)
+                (folder / "next").write_text(str(max(kept, default=-1) + 2))  # the last line may have been cut
+                command = [sys.executable, "-m", "benchmarks.fleet", "robot", server.uri, str(folder)]
+                child = subprocess.Popen(command, stdout=open(out, "w"))  # noqa: SIM115
+                end = time.monotonic() + _START_S
+                while not _printed(out) and time.monotonic() < end:
+                    time.sleep(0.02)
+            time.sleep(float(rng.uniform(0.05, 1.5)))
+            if kill % 2:
+                server.kill()
+                server.start()
+            else:
+                child.kill()
+                child.wait()
+                child = None
+        if child is not None:
+            child.kill()
+            child.wait()
+        kept |= _printed(out)
+        server.wait()
+        waiting = Outbox(folder / "outbox", 100.0)
+        left = {w.place.keyframe for w in waiting.oldest(10**6, 10**9)}
+        store = PlaceStore(server.uri, "7" * 64, Access(), timeout_s=60.0)
+        stored = [place.keyframe for place in store.scan() if not isinstance(place, str)]
+        lost, doubled = kept - left - set(stored), len(stored) - len(set(stored))
+        print(f"{count} kills, half of them of the store: {len(kept)} keyframes acknowledged by the outbox, "
+              f"{len(stored)} in the store, {len(left)} still wait; lost {len(lost)}, doubled {doubled}")  # fmt: skip
+        return int(bool(lost) or doubled > 0)
+
+
+def _printed(out: Path) -> set[int]:
+    lines = out.read_text().split("\n")[:-1] if out.exists() else []
+    return {int(line) for line in lines if line.isdigit()}
+
+
+def cut(seconds: float) -> int:
+    """0 where the local closures with a store that comes late, and with none, are the same byte for byte."""
+    from msg_adapters.loop_closures import closures_to_message
+    from pnv_core import PlaceRecognizer, load_describer
+    from pnv_fleet.fleet import Fleet, Options
+    from pnv_lab.worlds import loop_sequence
+
+    describer = load_describer("default")
+    frames = list(loop_sequence(1, "corridor", laps=2.0, fps=2.0))
+    with served() as server:
+        like = describer.describe(frames[0].rgb)
+        server.kill()
+        options = Options(server.uri, "robot", 500.0, server.folder.parent / "outbox", 1000.0, 0.0, 1.0, False)
+        model, calibration = describer.map_fingerprint, describer.model.info.calibration
+        fleet = Fleet(options, describer.config, model, like, calibration, lambda c: None, print)
+        start = time.monotonic()
+        both = PlaceRecognizer(describer), PlaceRecognizer(describer)
+        sent: tuple[list[bytes], list[bytes]] = ([], [])
+        times: tuple[list[float], list[float]] = ([], [])
+        for number, frame in enumerate(frames):
+            for i in (0, 1) if number % 2 else (1, 0):  # interleaved: with a fleet, without
+                begin = time.perf_counter()
+                found = [c for c in both[i].process(frame) if c.accepted]
+                if i == 0 and (query := both[0].latest) is not None:
+                    fleet.offer(query, both[0].database.first().stamp_ns)  # type: ignore[union-attr]
+                times[i].append(time.perf_counter() - begin)
+                sent[i].append(np.array(closures_to_message(found, ("camera",)).data).tobytes())
+            if number < len(frames) - 20:
+                pause = seconds / (len(frames) - 20) - (time.monotonic() - start) / (number + 1)
+                time.sleep(max(0.0, pause))
+            elif server.process.poll() is not None:
+                waiting = fleet.status().waiting
+                print(f"the store is back after {time.monotonic() - start:.0f} s; {waiting} keyframes wait")
+                server.start()
+        begin, end = time.monotonic(), time.monotonic() + 300
+        while fleet.status().waiting and time.monotonic() < end:
+            time.sleep(0.1)
+        status = fleet.status()
+        fleet.close()
+    same = sent[0] == sent[1]
+    late = [1e3 * np.percentile(t[5:], 95) for t in times]
+    print(f"local closures {'identical' if same else 'DIFFER'} ({sum(map(bool, sent[0]))} messages); outbox drained "
+          f"{time.monotonic() - begin:.0f} s after the last frame, {status.waiting} wait, {status.sent} sent, "
+          f"{status.dropped} dropped; p95 of a frame {late[0]:.1f} ms with, {late[1]:.1f} ms without")  # fmt: skip
+    return int(not same or status.waiting > 0)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     actions = parser.add_subparsers(required=True, dest="action")
     sized = actions.add_parser("scale")
     sized.add_argument("--sizes", type=int, nargs="+", default=[10_000, 100_000])
     sized.add_argument("--queries", type=int, default=200)
+    actions.add_parser("kills").add_argument("--kills", type=int, default=100)
+    actions.add_parser("cut").add_argument("--seconds", type=float, default=600.0)
+    child = actions.add_parser("robot")
+    child.add_argument("uri")
+    child.add_argument("folder", type=Path)
     args = parser.parse_args()
     os.nice(5)
-    if args.action == "scale":
+    if args.action == "kills":
+        return kills(args.kills)
+    if args.action == "cut":
+        return cut(args.seconds)
+    if args.action == "robot":
+        robot(args.uri, args.folder)
+    elif args.action == "scale":
         scale(args.sizes, args.queries)
     return 0
 

@@ -14,6 +14,7 @@ COMMANDS = {
     "bag": "what the node would publish of a bag, as a bag to play beside it",
     "match": "do two images show the same place?",
     "map": "inspect, check, merge, thin out, recover and export saved maps",
+    "fleet": "places that robots share: status, push, pull, query, forget, verify",
     "doctor": "check this machine, and say what to do",
     "bench": "how fast this machine is, and which settings keep up with a rate",
     "weights": "published models: list, fetch, verify",

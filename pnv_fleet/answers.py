@@ -4,6 +4,7 @@ from collections import OrderedDict
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.decide.consistency import SequenceMemory, window_of
@@ -46,6 +47,10 @@ class Answers:
         closures = self._judge.judged(query.ref, descriptor, query.predecessor, candidates, references, self.config)
         self._sequence.remember(query.ref.camera, closures, window_of(self.config.consistency))
         return [decided(closure, self.config, self._sequence) for closure in closures]
+
+    def keep(self, rgb: NDArray[np.uint8]) -> bytes:
+        """(H, W, 3) uint8 -> what is kept of an image to verify it."""
+        return self._judge.verifier.keep(rgb, "")
 
     def forget(self) -> None:
         """What comes next does not follow what went before."""

@@ -276,7 +276,8 @@ def connect(uri: str, access: Access, timeout_s: float) -> Any:
         if access.certificate:
             pems = {"ca_pem_path": access.ca, "client_pem_path": access.certificate, "client_key_path": access.key}
         more |= {"secure": True, **pems}
-    more["grpc_options"] = {"grpc.max_receive_message_length": _MOST_MESSAGE}
+    # each call has its own limit of time; pings more often than this make Milvus Lite's server close the connection
+    more["grpc_options"] = {"grpc.max_receive_message_length": _MOST_MESSAGE, "grpc.keepalive_time_ms": 600_000}
     try:
         return MilvusClient(uri, token=access.token, timeout=timeout_s, **more)
     except Exception as error:  # its own, grpc's, or of Milvus Lite in this process

@@ -49,7 +49,7 @@ def merge(first: Path, second: Path, output: Path) -> Manifest:
                 ref = replace(kf.ref, id=kf.ref.id + a.next_id, session=kf.ref.session + a.next_session)
                 yield replace(kf, ref=ref)
 
-        return _write_map(output, a, keyframes, a.next_id + b.next_id, a.next_session + b.next_session)
+        return write_map(output, a, keyframes, a.next_id + b.next_id, a.next_session + b.next_session)
 
 
 def prune(
@@ -93,7 +93,7 @@ def prune(
         def keyframes() -> Iterator[SavedKeyframe]:
             return (kf for kf in opened.keyframes() if kf.ref.id in refs)
 
-        return _write_map(output, manifest, keyframes, manifest.next_id, manifest.next_session)
+        return write_map(output, manifest, keyframes, manifest.next_id, manifest.next_session)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ def recover(path: Path, output: Path) -> Recovery:
             whole = {kf.ref.id: kf for kf in salvage(file)[1] if kf.ref.id in wanted}
             yield from (whole[i] for i in wanted)
 
-    _write_map(output, base, keyframes, base.next_id, max(base.next_session, next_session))
+    write_map(output, base, keyframes, base.next_id, max(base.next_session, next_session))
     return Recovery(len(ids), manifest.keyframes - len(ids) if manifest else None, tuple(problems))
 
 
@@ -167,7 +167,7 @@ def _salvage_all(files: list[Path], manifest: Manifest | None, problems: list[st
     return found
 
 
-def _write_map(
+def write_map(
     output: Path,
     like: Manifest,
     keyframes: Callable[[], Iterable[SavedKeyframe]],

@@ -1,0 +1,53 @@
+"""`pnv fleet` on a served store: a map goes up and a selection comes down as the same map."""
+
+import numpy as np
+
+from pnv_cli.main import main
+from pnv_core.database import KeyframeDatabase
+from pnv_core.describe.describer import load_describer
+from pnv_core.maps import MapStore
+from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.types import Frame
+from test.ros.camera import scene
+
+SECOND = 10**9
+
+
+def test_a_map_goes_up_is_queried_comes_down_and_is_forgotten(server, tmp_path, capsys):
+    import cv2
+
+    describer = load_describer("default", min_interval_s=0.0, min_change=0.0)
+    robot = PlaceRecognizer(describer)
+    for number in range(6):
+        robot.process(Frame((1_700_000_000 + number) * SECOND, "front", scene(number)))
+    MapStore(tmp_path / "up.map", describer.map_fingerprint).save(robot.database.snapshot())
+    uri = ["--uri", server.uri]
+    assert main(["fleet", "push", str(tmp_path / "up.map"), "--robot", "alpha", *uri]) == 0
+    assert main(["fleet", "push", str(tmp_path / "up.map"), "--robot", "alpha", *uri]) == 0  # again: the same places
+    assert main(["fleet", "status", *uri]) == 0
+    assert "6 places" in capsys.readouterr().out
+    cv2.imwrite(str(tmp_path / "query.png"), scene(3)[..., ::-1])
+    assert main(["fleet", "query", str(tmp_path / "query.png"), *uri]) == 0
+    best = capsys.readouterr().out.splitlines()[1]
+    assert "alpha" in best
+    assert "1700000003.0" in best
+    assert best.endswith("accepted")
+    since = ["--since", "2023-11-14T22:13:22"]  # 1,700,000,002 s
+    assert main(["fleet", "pull", *since, "-o", str(tmp_path / "down.map"), *uri]) == 0
+    down = KeyframeDatabase.for_describer(describer)
+    MapStore(tmp_path / "down.map", describer.map_fingerprint).load(down)
+    assert [ref.stamp_ns // SECOND - 1_700_000_000 for ref in down.refs()] == [2, 3, 4, 5]
+    np.testing.assert_allclose(down.vector(down.refs()[1].id), robot.database.vector(3), atol=1e-6)
+    assert main(["fleet", "verify", *uri]) == 0
+    assert main(["fleet", "forget", *uri]) == 2
+    assert "allowed: --robot" in capsys.readouterr().err
+    assert main(["fleet", "forget", *since, *uri]) == 0
+    assert "forgot 4 places, 2 are left" in capsys.readouterr().out
+
+
+def test_no_store_and_a_store_that_is_not_there_are_one_line(tmp_path, capsys):
+    assert main(["fleet", "status", "--uri", ""]) == 2
+    assert main(["fleet", "status", "--uri", str(tmp_path / "none.db")]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert "does not exist" in lines[1]
