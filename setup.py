@@ -69,7 +69,7 @@ SLAM = [
     "matplotlib>=3.8",
 ]
 
-BRIDGES = ("tf_bridge",)
+BRIDGES = ("tf_bridge", "rtabmap_bridge", "hydra_bridge", "swarm_slam_bridge")
 
 setup(
     name=PACKAGE,

@@ -54,6 +54,11 @@ class StampIds:
         if stamp is not None:
             self._nodes.remove((stamp, node))
 
+    def begin_anew(self) -> None:
+        """The back end was restarted: its nodes are forgotten, closures go on waiting for the new ones."""
+        self._nodes.clear()
+        self._ids.clear()
+
     def add_closure(self, closure: LoopClosure) -> list[NodePair]:
         """A closure as it was published. Gives what can be handed on now, this one or others."""
         self._waiting.append(closure)

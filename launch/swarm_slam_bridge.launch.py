@@ -1,0 +1,27 @@
+"""swarm_slam_bridge beside a running place_recognizer and Swarm-SLAM, in the namespace of the robot.
+
+ros2 launch pnv_ros swarm_slam_bridge.launch.py
+"""
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS = {
+    "camera_in_body": ("[0.0, 0.0, 0.0, 0.0, 0.0, 0.0]", "x, y, z, roll, pitch, yaw of the camera's housing"),
+}
+
+
+def generate_launch_description():
+    return LaunchDescription(
+        [
+            *[DeclareLaunchArgument(n, default_value=d, description=t) for n, (d, t) in ARGUMENTS.items()],
+            Node(
+                package="pnv_ros",
+                executable="swarm_slam_bridge",
+                output="screen",
+                parameters=[{name: LaunchConfiguration(name) for name in ARGUMENTS}],
+            ),
+        ]
+    )
