@@ -104,6 +104,7 @@ setup(
             "place_recognizer = pnv_ros.place_recognizer:main",
             *(f"{name} = pnv_ros.bridges.{name}:main" for name in BRIDGES),
             "pnv = pnv_cli.main:main",
+            "pnv_view = pnv_ros.watch:main",
         ]
     },
     zip_safe=False,

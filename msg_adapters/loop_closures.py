@@ -184,6 +184,20 @@ def candidates_to_message(closures: Sequence[LoopClosure], cameras: Sequence[str
     return message
 
 
+def candidates_table(message: Any) -> np.ndarray:
+    """The rows of a candidates message as a structured array, by the message's own fields."""
+    kinds = {code: kind for kind, code in _POINT_TYPES.items()}
+    row = np.dtype(
+        {
+            "names": [field.name for field in message.fields],
+            "formats": [f"<{kinds[field.datatype]}" for field in message.fields],
+            "offsets": [field.offset for field in message.fields],
+            "itemsize": message.point_step,
+        }
+    )
+    return np.frombuffer(bytes(message.data), row)
+
+
 def _camera_index(camera: str, cameras: Sequence[str]) -> int:
     return cameras.index(camera) if camera in cameras else NO_CAMERA
 
