@@ -9,12 +9,12 @@ PACKAGE = "pnv_ros"
 REQUIRED = [
     "numpy>=1.26",
     "opencv-python-headless>=4.8",
-    "torch>=2.4",  # torch.load(weights_only=True) with an allow list, used for published checkpoints
+    "openvino>=2025.2",  # the network on the robot's processor: x86-64 and aarch64
+    "torch>=2.4",  # training, CUDA, and reading published checkpoints (weights_only with an allow list)
     "faiss-cpu>=1.8",
     "safetensors>=0.4",
     "pillow>=10",  # resizes as the reference does
     "scipy>=1.11",
-    "numba>=0.60",  # compiled inner loops; the code runs without it, slower
     "threadpoolctl>=3",
     "tqdm>=4.60",
     "msgspec>=0.18",  # what files say is checked against types and bounds

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pnv_core import load_describer
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer
+from pnv_core.describe.model_files import Model
 from pnv_core.files import atomic_write
 from pnv_core.images import read_image
 from pnv_core.types import PatchGrid, PlaceDescriptor
@@ -27,7 +28,6 @@ from pnv_core.verify.reranker import Reranker
 SIZES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
 MODES = {
     "exact": {},
-    "fast patches": {"patch_mode": "fast"},
     "bfloat16 trunk": {"trunk_precision": "bfloat16"},
 }
 
@@ -35,8 +35,9 @@ MODES = {
 def describer_of(threads: int, **settings: str) -> Describer:
     """The default model whose patches share the global projection."""
     default = load_describer(threads=threads)
+    shared = {name: t for name, t in default.model.tensors.items() if not name.startswith("patch_projection.")}
     config = Config.make(patch_sizes=SIZES, patch_strides=(1, 1, 1), patch_weights=WEIGHTS, threads=threads, **settings)
-    return Describer(replace(default.model, patch_projection=None), config)
+    return Describer(Model(default.model.info, shared), config)
 
 
 def described(describer: Describer, paths: list[Path]) -> list[PlaceDescriptor]:

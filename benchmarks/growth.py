@@ -11,8 +11,10 @@ import torch.nn.functional as F
 
 from pnv_core.config import Config
 from pnv_core.database import KeyframeDatabase
-from pnv_core.describe.patches import PatchAggregator
-from pnv_core.threads import workers
+from pnv_core.describe.model_files import ModelInfo, build_model
+from pnv_core.describe.openvino_describing import head
+from pnv_core.describe.trunks.vgg16 import vgg16_trunk
+from pnv_core.networks.openvino_backend import Compiled
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
 
@@ -32,12 +34,17 @@ def _ms(function: Callable[[], Any]) -> float:
 
 def _patches_ms(cells: tuple[int, int], sizes: tuple[int, ...], clusters: int, dim: int, threads: int) -> float:
     rng = np.random.default_rng(0)
-    centroids = F.normalize(torch.from_numpy(rng.standard_normal((clusters, _CHANNELS), np.float32))) * 0.3
-    projection = torch.from_numpy(rng.standard_normal((dim, clusters * _CHANNELS), np.float32))
-    aggregator = PatchAggregator(centroids, projection, torch.zeros(dim), workers(threads))
-    x = F.normalize(torch.from_numpy(rng.standard_normal((_CHANNELS, cells[0] * cells[1]), np.float32)), dim=0)
-    weights = torch.softmax(20 * centroids @ x, dim=0)
-    return _ms(lambda: aggregator(x, weights, cells, sizes, (1,) * len(sizes)))
+    centroids = F.normalize(torch.from_numpy(rng.standard_normal((clusters, _CHANNELS), np.float32))).numpy() * 0.3
+    tensors = {f"trunk.{name}": np.zeros(shape) for name, shape in vgg16_trunk().tensor_shapes().items()} | {
+        "netvlad.centroids": centroids,
+        "netvlad.assignment": 20 * centroids,
+        "global_projection.weight": rng.standard_normal((dim, clusters * _CHANNELS), np.float32),
+        "global_projection.bias": np.zeros(dim),
+    }
+    model = build_model(ModelInfo("vgg16"), tensors, "benchmark")
+    graph = Compiled(lambda: head(model, cells, [(size, 1) for size in sizes]), threads)
+    maps = rng.standard_normal((1, _CHANNELS, *cells), np.float32)
+    return _ms(lambda: graph(maps, maps, np.ones((1, 1, *cells), np.float32)))
 
 
 def _retrieval_ms(keyframes: int, dim: int = 512) -> float:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer, describer_from, resized
 from pnv_core.describe.netvlad import NetVLAD, gem
-from pnv_core.describe.trunks import TRUNKS
-from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.types import PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
 from pnv_lab.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
@@ -116,7 +116,7 @@ def ranked(queries: NDArray, references: NDArray, counted: NDArray[np.bool_]) ->
 
 
 @torch.inference_mode()
-def baseline_vectors(trunk: Trunk, heads: dict[str, Head], images: Sequence[Path | Pixels]) -> dict[str, NDArray]:
+def baseline_vectors(trunk: TorchTrunk, heads: dict[str, Head], images: Sequence[Path | Pixels]) -> dict[str, NDArray]:
     found: dict[str, list[NDArray]] = {name: [] for name in heads}
     for image in images:
         features = trunk(as_batch([pixels(image, SIZE)])).float()
@@ -129,22 +129,22 @@ def pixels(image: Path | Pixels, size: tuple[int, int]) -> Pixels:
     return read_rgb(image, *size) if isinstance(image, Path) else resized(image, *size)
 
 
-def fitted(trunk: Trunk, files: Sequence[Path]) -> NetVLAD:
+def fitted(trunk: TorchTrunk, files: Sequence[Path]) -> NetVLAD:
     with torch.inference_mode():
         maps = (trunk(as_batch([read_rgb(f, *SIZE)])) for f in files)
         return vocabulary_of(maps, FitOptions(clusters=16, cells_per_image=60))
 
 
-def baselines(args: argparse.Namespace) -> list[tuple[Trunk, dict[str, Head]]]:
+def baselines(args: argparse.Namespace) -> list[tuple[TorchTrunk, dict[str, Head]]]:
     """Trunks and what is made of their maps, vocabularies fitted to some of the training photographs."""
     sample = image_files([args.train])
     sample = sorted(random.Random(args.seed).sample(sample, min(200, len(sample))))
-    found: list[tuple[Trunk, dict[str, Head]]] = []
+    found: list[tuple[TorchTrunk, dict[str, Head]]] = []
     if args.imagenet and "untrained" in args.methods.split(","):
         trunk = imagenet_trunk(args.imagenet, fires=8, relu=True)
         found.append((trunk, {"untrained, GeM": gem, "untrained, NetVLAD k-means": fitted(trunk, sample)}))
     if "rootsift" in args.methods.split(","):
-        sift = TRUNKS.make("rootsift")
+        sift = TorchTrunk(rootsift_trunk())
         found.append((sift, {"dense RootSIFT VLAD": fitted(sift, sample)}))
     return found
 

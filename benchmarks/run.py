@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 import pnv_core.openmp  # noqa: F401 - before torch is loaded  # isort: skip
+import openvino as ov
 import torch
 import torch.nn.functional as F
 
@@ -26,10 +27,15 @@ from benchmarks import baseline
 from benchmarks.growth import measured_growth, plotted
 from pnv_core.config import Config
 from pnv_core.describe.describer import load_describer
-from pnv_core.describe.patches import PatchAggregator, bfloat16_is_fast
-from pnv_core.describe.trunks.compact import CompactTrunk
-from pnv_core.describe.trunks.vgg16 import VGG16Trunk
+from pnv_core.describe.model_files import ModelInfo, build_model
+from pnv_core.describe.openvino_describing import head
+from pnv_core.describe.patches import patch_descriptors
+from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.files import atomic_write
+from pnv_core.networks.openvino_backend import Compiled, build, fast_precisions, image_input
 from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
@@ -104,28 +110,32 @@ def patches_row(clusters: int, dim: int, threads: int, rounds: int) -> dict[str,
     rng = np.random.default_rng(0)
     features = smooth_features(rng, CELLS, CHANNELS)
     centroids, assignment, projection, bias = vocabulary(rng, clusters, dim)
-    pool = workers(threads)
-    aggregators = {
-        mode: PatchAggregator(centroids, projection, bias, pool, mode == "fast") for mode in ("exact", "fast")
+    trunk = {f"trunk.{name}": np.zeros(shape) for name, shape in vgg16_trunk().tensor_shapes().items()}
+    tensors = {
+        "netvlad.centroids": centroids,
+        "netvlad.assignment": assignment,
+        "global_projection.weight": projection,
+        "global_projection.bias": bias,
     }
+    model = build_model(ModelInfo("vgg16"), trunk | {name: t.numpy() for name, t in tensors.items()}, "benchmark")
+    graph = Compiled(lambda: head(model, CELLS, [(size, 1) for size in SIZES]), threads)
+    maps, cells = features.numpy(), np.ones((1, 1, *CELLS), np.float32)
 
-    def product(mode: str) -> list[np.ndarray]:
+    def eager() -> list[torch.Tensor]:
         x = F.normalize(features[0].flatten(1), dim=0)
         weights = torch.softmax(assignment @ x, dim=0)
-        return aggregators[mode](x, weights, CELLS, SIZES, (1, 1, 1))
+        return patch_descriptors(x, weights, centroids, projection, bias, CELLS, SIZES, (1, 1, 1))
 
     def plain() -> list[torch.Tensor]:
         return baseline.patch_descriptors(features, assignment, centroids, projection, bias, SIZES)
 
     row = compared(
         f"patches 2, 5, 8 at 640x480, K={clusters}, D={dim}",
-        {"baseline": plain, "exact": lambda: product("exact"), "fast": lambda: product("fast")},
+        {"baseline": plain, "openvino": lambda: graph(maps, maps, cells), "torch": eager},
         rounds,
     )
     flops = 2 * clusters * dim * CHANNELS * CELLS[0] * CELLS[1]
-    row["exact_gflops"] = round(flops / row["sides"]["exact"]["ms"] / 1e6, 1)
-    pairs = list(zip(product("exact"), product("fast"), strict=True))
-    row["fast_worst_1_minus_cosine"] = float(max((1 - (e * f).sum(1)).max() for e, f in pairs))
+    row["gflops"] = round(flops / row["sides"]["openvino"]["ms"] / 1e6, 1)
     return row
 
 
@@ -177,32 +187,39 @@ def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: 
     return compared(f"re-ranking {candidates} candidates, sizes 2, 5, 8, {scorer}, D={dim}", sides, rounds)
 
 
-def trunk_row(name: str, trunk: torch.nn.Module, size: tuple[int, int], rounds: int) -> dict[str, Any]:
+def trunk_row(name: str, trunk: Trunk, size: tuple[int, int], threads: int, rounds: int) -> dict[str, Any]:
     torch.manual_seed(0)
-    for parameter in trunk.parameters():
+    eager = TorchTrunk(trunk).eval().requires_grad_(False)
+    for parameter in eager.parameters():
         if parameter.ndim == 4:
             torch.nn.init.kaiming_normal_(parameter)
-    trunk.eval().requires_grad_(False)
-    image = torch.rand(1, 3, *size)
+    weights = {name: tensor.numpy() for name, tensor in eager.state_dict().items()}
+    rgb = np.random.default_rng(0).integers(0, 256, (1, *size, 3), np.uint8)
+    image = torch.from_numpy(rgb[0]).permute(2, 0, 1)[None].float() / 255
     packed = image.contiguous(memory_format=torch.channels_last)
-    channels_last = deepcopy(trunk).to(memory_format=torch.channels_last)
+    channels_last = deepcopy(eager).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     sides: dict[str, Callable[[], Any]] = {
-        "baseline": lambda: trunk(image),
+        "baseline": lambda: eager(image),
         "channels last": lambda: channels_last(packed),
     }
-    if bfloat16_is_fast():
-        half, half_image = deepcopy(channels_last).bfloat16(), packed.bfloat16()
-        sides["bfloat16"] = lambda: half(half_image)
+    for precision, said in (("float32", "FP32"), ("bfloat16", "BF16")):
+        if said in fast_precisions():
+            pixels, scaled = image_input(size[1], size[0])
+            output = build((*trunk.layers, *trunk.neck), weights, scaled)
+            compiled = Compiled(partial(ov.Model, [output], [pixels], name), threads, precision)
+            sides[f"openvino {precision}"] = partial(compiled, rgb)
     return compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
 
 
 def describing_row(size: tuple[int, int], threads: int, rounds: int) -> dict[str, Any]:
-    """Describer.describe of the default model with one and with three patch sizes."""
+    """Describer.describe of the default model: torch, and OpenVINO in both precisions."""
     rgb = np.random.default_rng(0).integers(0, 256, (size[1], size[0], 3), np.uint8)
     sides = {}
-    for sizes in ((2,), SIZES):
-        describer = load_describer(image_width=size[0], image_height=size[1], patch_sizes=sizes, threads=threads)
-        sides["patch size " + ", ".join(map(str, sizes))] = partial(describer.describe, rgb)
+    for backend, precision in (("torch", "float32"), ("openvino", "float32"), ("openvino", "bfloat16")):
+        describer = load_describer(
+            image_width=size[0], image_height=size[1], threads=threads, backend=backend, trunk_precision=precision
+        )
+        sides[f"{backend} {precision}"] = partial(describer.describe, rgb)
     return compared(f"describe() at {size[0]}x{size[1]}", sides, rounds)
 
 
@@ -267,11 +284,11 @@ def main() -> int:
         count = 10 if args.quick else 100
         rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
         rows.append(reranking_row(128, "ransac", count, args.threads, 1 if args.quick else args.rounds))
-        rows.append(trunk_row("compact trunk", CompactTrunk(), (240, 320), 5 * args.rounds))
+        rows.append(trunk_row("compact trunk", compact_trunk(), (288, 384), args.threads, 5 * args.rounds))
         sizes = ((320, 240),) if args.quick else ((320, 240), (384, 288), (640, 480))
         rows += [describing_row(size, args.threads, 5 * args.rounds) for size in sizes]
         if not args.quick:
-            rows.append(trunk_row("VGG16", VGG16Trunk(), (480, 640), args.rounds))
+            rows.append(trunk_row("VGG16", vgg16_trunk(), (480, 640), args.threads, args.rounds))
         growth = {} if args.quick else measured_growth(args.threads)
     report = {"machine": machine(), "roofline": peak, "rows": rows, "growth": growth}
     args.out.mkdir(parents=True, exist_ok=True)

@@ -56,6 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     from pnv_core.describe.download import resolve_weights
     from pnv_core.describe.model_files import ModelInfo, load_model, save_model
+    from pnv_core.describe.torch_model import TorchModel, TorchTrunk
     from pnv_core.describe.trunks import TRUNKS
     from pnv_lab.fit import adapt_model, fit_model, image_files
 
@@ -72,19 +73,21 @@ def run(args: argparse.Namespace) -> int:
     base = None if args.trunk else load_model(resolve_weights(args.weights))
     anew = bool(base is None or args.anew or args.clusters or args.global_dim or args.patch_dim or args.no_whiten)
     if anew:
-        trunk = (TRUNKS.make(args.trunk) if base is None else base.trunk).to(args.device)
+        trunk = TorchTrunk(TRUNKS.make(args.trunk)) if base is None else TorchModel.of(base).trunk
         info = ModelInfo(args.trunk) if base is None else base.info
-        model = fit_model(trunk, info, files, _options(args, base), _bar)
+        model = fit_model(trunk.to(args.device), info, files, _options(args, base), _bar)
     else:
         assert base is not None
-        base.trunk.to(args.device)
-        model = adapt_model(base, files, _bar)
+        adapted = TorchModel.of(base)
+        adapted.trunk.to(args.device)
+        model = adapt_model(adapted, files, _bar)
     what = "vocabulary and projections fitted" if anew else "global projection adapted"
     source = (args.trunk if base is None else base.info.provenance or base.info.trunk).strip()
-    model = model.with_info(provenance=f"{what} to {len(files)} images by pnv fit; before: {source}", calibration=None)
-    save_model(model, output)
+    provenance = f"{what} to {len(files)} images by pnv fit; before: {source}"
+    fitted = model.model().with_info(provenance=provenance, calibration=None)
+    save_model(fitted, output)
     print(
-        f"{output}: {what}; K = {model.netvlad.clusters}, D = {model.global_dim}, patches D = {model.patch_dim}, "
+        f"{output}: {what}; K = {fitted.clusters}, D = {fitted.global_dim}, patches D = {fitted.patch_dim}, "
         f"{output.stat().st_size / 1e6:.1f} MB"
     )
     if all(measured):
@@ -98,7 +101,7 @@ def _options(args: argparse.Namespace, base: "Model | None") -> "FitOptions":
 
     plain = FitOptions(patch_dim=64)
     given: dict[str, Any] = {
-        "clusters": args.clusters or (base.netvlad.clusters if base else plain.clusters),
+        "clusters": args.clusters or (base.clusters if base else plain.clusters),
         "global_dim": args.global_dim or (base.global_dim if base else plain.global_dim),
         "patch_dim": args.patch_dim or (base.patch_dim if base else plain.patch_dim),
     }

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None:
-    import torch
+    import numpy as np
 
     from pnv_core.describe.model_files import ModelInfo, save_model
     from pnv_core.describe.trunks.compact import FIRES
@@ -117,7 +117,7 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
     settings = {"places": args.places, "views": args.views, "pool": args.pool, "fit": asdict(fit)}
     trainer = Trainer(model, batches, _validation(held), options, folder, args.device, settings)
     model = trainer.run(lambda items, done, total: bar(items, desc="training", initial=done, total=total, unit="step"))
-    save_model(model, output, torch.float16)
+    save_model(model.model(), output, np.float16)
     _report(trainer.journal, folder, output)
 
 
@@ -126,7 +126,8 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
     import numpy as np
     import torch
 
-    from pnv_core.describe.model_files import Model, ModelInfo, save_model
+    from pnv_core.describe.model_files import ModelInfo, save_model
+    from pnv_core.describe.torch_model import TorchModel
     from pnv_lab.fit import FitOptions, as_batch, projections_of, vocabulary_of
     from pnv_lab.training.augment import flat_view
     from pnv_lab.training.triplets import TripletOptions, TripletTrainer
@@ -163,7 +164,7 @@ def _train_vgg16(args: argparse.Namespace, folder: Path, output: Path) -> None:
     info = ModelInfo(
         "vgg16", {}, *size, provenance=f"pnv train --trunk vgg16, {options.epochs} epochs on {len(flat)} images"
     )
-    save_model(Model(info, trunk.cpu(), netvlad, whole), output)
+    save_model(TorchModel(info, trunk.cpu(), netvlad, whole).model(), output)
     _report(trainer.journal, folder, output)
 
 

@@ -53,7 +53,7 @@ def _verify(args: argparse.Namespace) -> int:
         if recorded and recorded != digest:
             raise ModelError(f"{path}: sha256 {digest} differs from the recorded {recorded}; fetch it again")
     print(
-        f"{path}: {model.info.trunk}, K={model.netvlad.clusters}, D={model.global_dim}, patch D={model.patch_dim}, "
+        f"{path}: {model.info.trunk}, K={model.clusters}, D={model.global_dim}, patch D={model.patch_dim}, "
         f"fingerprint {model.fingerprint()[:16]}, sha256 {digest}"
     )
     return 0

@@ -53,6 +53,11 @@ class Config:
     _describing = Section("Describing")
     weights: str = setting("default", "model: 'default' (in the package), a published name, or a file")
     device: str = setting("cpu", "where the network runs", choices=("cpu", "cuda", "auto"))
+    backend: str = setting(
+        "auto",
+        "library the network runs in; auto: openvino on the processor, torch on cuda",
+        choices=("auto", "openvino", "torch"),
+    )
     trunk_precision: str = setting(
         "float32",
         "arithmetic of the network; bfloat16 is faster where the processor has it",
@@ -73,9 +78,6 @@ class Config:
     )
     patch_weights: tuple[float, ...] = setting(
         (), "fusion weight per patch size, sum 1; empty = the model's", kind=float, low=0.0, high=1.0
-    )
-    patch_mode: str = setting(
-        "exact", "patch aggregation: exact, or fast (products in bfloat16 where it is fast)", choices=("exact", "fast")
     )
 
     _keyframes = Section("Keyframes")

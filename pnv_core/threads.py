@@ -1,55 +1,50 @@
-"""Threads: one pool of Python threads for compiled kernels and matrix products, so that pools never multiply."""
+"""Threads: one pool of Python threads for matrix products and OpenCV, so that pools never multiply."""
 
 import functools
 import itertools
 import os
-import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import cv2
 import threadpoolctl
-import torch
 
 T = TypeVar("T")
 
 
 class Workers:
-    """Runs a function over parts in `threads` threads; the function must release the GIL where its work is.
-
-    While it exists, numpy's BLAS and OpenCV run in the thread that calls them: the parts are the parallelism.
-    """
+    """Runs a function over parts in `threads` threads; the function must release the GIL where its work is."""
 
     def __init__(self, threads: int) -> None:
         self.threads = threads
-        self._pool = _pool(threads) if threads > 1 else None
-        self._limit = threadpoolctl.threadpool_limits(limits=1, user_api="blas")
-        cv2.setNumThreads(1)
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="pnv") if threads > 1 else None
 
     def map(self, function: Callable[[Any], T], parts: Iterable[Any]) -> list[T]:
         """The results in the order of the parts; the first exception is raised."""
         parts = list(parts)
         if self._pool is None or len(parts) < 2:
             return [function(part) for part in parts]
-        return list(self._pool.map(function, parts))
+        with alone():
+            return list(self._pool.map(function, parts))
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads in which torch, too, works alone. torch sets both the calling thread's number and that of new threads."""
-    others = torch.get_num_threads()
-    started = threading.Barrier(threads)
+@contextmanager
+def alone() -> Iterator[None]:
+    """Meanwhile numpy's BLAS and OpenCV run in the thread that calls them: the parts are the parallelism."""
+    before = cv2.getNumThreads()
+    with _blas().limit(limits=1, user_api="blas"):
+        cv2.setNumThreads(1)
+        try:
+            yield
+        finally:
+            cv2.setNumThreads(before)
 
-    def start() -> None:
-        torch.get_num_threads()  # takes the number of new threads, which would otherwise come later and win
-        torch.set_num_threads(1)
-        started.wait()
 
-    pool = ThreadPoolExecutor(threads, thread_name_prefix="pnv")
-    for done in [pool.submit(start) for _ in range(threads)]:
-        done.result()
-    torch.set_num_threads(others)
-    return pool
+@functools.cache
+def _blas() -> threadpoolctl.ThreadpoolController:
+    return threadpoolctl.ThreadpoolController()
 
 
 @functools.cache

@@ -13,10 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from pnv_core.describe.describer import resized
-from pnv_core.describe.model_files import Model, ModelInfo
+from pnv_core.describe.model_files import ModelInfo
 from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule, gem
 from pnv_core.describe.patches import patch_vlads
-from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.errors import ModelError
 from pnv_core.images import SUFFIXES, read_image
 
@@ -128,14 +128,14 @@ def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
 
 
 @torch.no_grad()
-def maps_of(trunk: Trunk, path: Path, options: FitOptions) -> tuple[Tensor, Tensor]:
+def maps_of(trunk: TorchTrunk, path: Path, options: FitOptions) -> tuple[Tensor, Tensor]:
     """The trunk's maps (1, C, h, w) and (1, W, h, w) of an image file, on the device of the trunk."""
     device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
     features, wide = trunk.maps(as_batch([read_rgb(path, options.image_width, options.image_height)], device))
     return features.float(), wide.float()
 
 
-def features_of(trunk: Trunk, path: Path, options: FitOptions) -> Tensor:
+def features_of(trunk: TorchTrunk, path: Path, options: FitOptions) -> Tensor:
     """The feature map (1, C, h, w) of an image file."""
     return maps_of(trunk, path, options)[0]
 
@@ -193,7 +193,7 @@ def pooled_projection_of(maps: Iterable[Tensor], options: FitOptions) -> Project
 
 
 def fit_vocabulary(
-    trunk: Trunk, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
+    trunk: TorchTrunk, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
 ) -> NetVLAD:
     """A NetVLAD layer from image files."""
     return vocabulary_of((features_of(trunk, file, options) for file in progress(files, "vocabulary")), options)
@@ -216,7 +216,7 @@ def adapted_projection(projection: Projection, vlads: Tensor, shrinkage: float =
 
 
 @torch.no_grad()
-def adapt_model(model: Model, files: Sequence[Path], progress: Progress = plain_progress) -> Model:
+def adapt_model(model: TorchModel, files: Sequence[Path], progress: Progress = plain_progress) -> TorchModel:
     """The model with its global projection adapted to the images; trunk, vocabulary and patches stay as trained.
 
     Raises ModelError for fewer than eight images.
@@ -236,8 +236,8 @@ def adapt_model(model: Model, files: Sequence[Path], progress: Progress = plain_
 
 
 def fit_model(
-    trunk: Trunk, info: ModelInfo, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
-) -> Model:
+    trunk: TorchTrunk, info: ModelInfo, files: Sequence[Path], options: FitOptions, progress: Progress = plain_progress
+) -> TorchModel:
     """A whole model around a ready trunk. `global_dim` falls to what the number of images can fill."""
     trunk.eval()
     if min(options.image_width, options.image_height) < trunk.stride * max(options.patch_sizes):
@@ -255,7 +255,7 @@ def fit_model(
         patch_sizes=options.patch_sizes,
         patch_weights=options.patch_weights,
     )
-    return Model(info, trunk, netvlad, whole, parts)
+    return TorchModel(info, trunk, netvlad, whole, parts)
 
 
 def _projection(weight: Tensor, bias: Tensor) -> Projection:

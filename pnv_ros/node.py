@@ -226,9 +226,9 @@ class PlaceRecognizerNode(LifecycleNode):
         return "\n".join(
             [
                 "place recogniser",
-                f"  model        {config.weights} ({info.trunk}, K = {describer.model.netvlad.centroids.shape[0]}, "
+                f"  model        {config.weights} ({info.trunk}, K = {describer.model.clusters}, "
                 f"D = {describer.model.global_dim}, {describer.fingerprint[:12]})",
-                f"  device       {describer.device}, {config.threads or 'all'} threads",
+                f"  network      {describer.backend}, {config.trunk_precision}, {config.threads or 'all'} threads",
                 f"  preset       {config.preset}: {config.image_width}x{config.image_height} px, patches "
                 f"{', '.join(map(str, config.patch_sizes))}, {config.scorer}, accepted from {config.accept_score:g}",
                 f"  memory       {per_keyframe / 1e6:.3f} MB per keyframe, {config.memory_budget_mb:g} MB for "

@@ -2,29 +2,21 @@
 
 import numpy as np
 import pytest
-import torch
-import torch.nn.functional as F
 
 from pnv_core import Config, Describer, Frame, PlaceRecognizer
-from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
-from pnv_core.describe.netvlad import NetVLAD, Projection
+from pnv_core.describe.model_files import ModelInfo, build_model, load_model, save_model
 from pnv_core.describe.trunks import TRUNKS
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ConfigError, ModelError
+from pnv_core.networks.layers import AvgPool, Crop, SpaceToDepth
 from pnv_core.verify.verifier import VERIFIERS, EpipolarCheck
 
 EVERY_FRAME = {"min_interval_s": 0.0, "min_change": 0.0, "exclude_recent_s": 10.0, "threads": 1}
 
 
-class Quarters(Trunk):
+def quarters():
     """Mean colours of the four quarters of each 14 px square: stride 14, which no shipped trunk has."""
-
-    channels = 12
-    stride = 14
-
-    def forward(self, images):
-        height, width = (side // 14 * 14 for side in images.shape[2:])
-        return F.pixel_unshuffle(F.avg_pool2d(images[:, :, :height, :width], 7), 2)
+    return Trunk((Crop(14), AvgPool(7, 7), SpaceToDepth(2)), stride=14)
 
 
 class SamePicture:
@@ -44,16 +36,16 @@ class SamePicture:
 
 @pytest.fixture
 def toy_model():
-    TRUNKS.register("quarters", Quarters)
-    generator = torch.Generator().manual_seed(0)
-    netvlad, projection = NetVLAD(4, 12), Projection(48, 16)
-    netvlad.centroids.data = torch.rand(4, 12, generator=generator)
-    netvlad.assignment.data = torch.randn(4, 12, generator=generator) * 5
-    projection.weight.data = torch.randn(16, 48, generator=generator)
+    TRUNKS.register("quarters", quarters)
+    rng = np.random.default_rng(0)
+    tensors = {
+        "netvlad.centroids": rng.random((4, 12)),
+        "netvlad.assignment": rng.normal(size=(4, 12)) * 5,
+        "global_projection.weight": rng.normal(size=(16, 48)),
+        "global_projection.bias": np.zeros(16),
+    }
     info = ModelInfo("quarters", image_width=210, image_height=140, patch_sizes=(2,), patch_weights=(1.0,))
-    for module in (netvlad, projection):
-        module.requires_grad_(False)
-    return Model(info, Quarters(), netvlad, projection)
+    return build_model(info, tensors, "toy model")
 
 
 def test_a_trunk_of_another_stride_describes_matches_and_is_saved(toy_model, tmp_path):

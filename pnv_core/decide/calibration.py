@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from safetensors import safe_open
 
@@ -135,10 +134,10 @@ def calibration_for(stored: dict[str, Any] | None, config: Config) -> Calibratio
 
 def write_calibration(path: Path | str, calibration: Calibration) -> None:
     """Put the calibration into a model file, whole or not at all; the tensors and the fingerprint stay as they are."""
-    with safe_open(str(path), framework="pt") as file:
+    with safe_open(str(path), framework="np") as file:
         kept = {file.get_tensor(name).dtype for name in file.keys()}  # noqa: SIM118 - no mapping
     model = load_model(path).with_info(calibration=calibration.to_json())
-    save_model(model, path, dtype=kept.pop() if len(kept) == 1 else torch.float32)
+    save_model(model, path, dtype=kept.pop() if len(kept) == 1 else np.float32)
 
 
 def fit_calibration(

@@ -7,12 +7,11 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from pnv_core.describe.model_files import Model, ModelInfo, build_model
-from pnv_core.describe.trunks.vgg16 import VGG16Trunk
+from pnv_core.describe.model_files import Model, ModelInfo, Tensors, build_model
+from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.errors import ModelError
+
+_CONVOLUTIONS = ("pool.conv.weight", "WPCA.0.weight")  # 1x1, taken as matrices
 
 
 def load_checkpoint(path: Path | str) -> Model:
@@ -20,6 +19,8 @@ def load_checkpoint(path: Path | str) -> Model:
 
     Only plain tensors are unpickled (weights_only). Raises ModelError for anything else, naming file and fault.
     """
+    import torch  # slow to import; what was read is kept converted (describer.read_model)
+
     source = str(path)
     try:
         content = torch.load(source, map_location="cpu", weights_only=True)
@@ -37,30 +38,33 @@ def load_checkpoint(path: Path | str) -> Model:
     )
 
 
-def _renamed(content: Any, source: str) -> dict[str, Tensor]:
+def _renamed(content: Any, source: str) -> Tensors:
     """The checkpoint's tensors under the names of a model file."""
     state = content.get("state_dict") if isinstance(content, dict) else None
     if not isinstance(state, dict):
         held = sorted(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise ModelError(f"{source}: holds {held}; allowed: a dict of num_pcs and state_dict")
-    expected = {f"encoder.{name.removeprefix('features.')}": f"trunk.{name}" for name in VGG16Trunk().state_dict()}
+    expected = {f"encoder.{name.removeprefix('features.')}": f"trunk.{name}" for name in vgg16_trunk().tensor_shapes()}
     expected |= {
         "pool.centroids": "netvlad.centroids",
         "pool.conv.weight": "netvlad.assignment",
         "WPCA.0.weight": "global_projection.weight",
         "WPCA.0.bias": "global_projection.bias",
     }
-    tensors: dict[str, Tensor] = {}
+    tensors: Tensors = {}
+    shapes = {}
     unexpected = []
     for given, tensor in state.items():
         key = str(given).replace("module.", "")
-        if key not in expected or not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+        array = tensor.numpy() if hasattr(tensor, "is_floating_point") and tensor.is_floating_point() else None
+        if key not in expected or array is None:
             unexpected.append(str(given))
             continue
         name = expected[key]
         if name in tensors:
             raise ModelError(f"{source}: {key} occurs twice, with and without 'module.'")
-        tensors[name] = tensor.flatten(1) if name in ("netvlad.assignment", "global_projection.weight") else tensor
+        shapes[key] = array.shape
+        tensors[name] = array.reshape(len(array), -1) if key in _CONVOLUTIONS else array
     if unexpected:
         raise ModelError(
             f"{source}: unexpected keys {', '.join(sorted(unexpected)[:4])}; "
@@ -68,14 +72,13 @@ def _renamed(content: Any, source: str) -> dict[str, Tensor]:
         )
     if missing := [key for key, name in expected.items() if name not in tensors]:
         raise ModelError(f"{source}: lacks {', '.join(missing[:4])}{' ...' if len(missing) > 4 else ''}")
-    for key in ("pool.conv.weight", "WPCA.0.weight"):
-        raw = next(t for k, t in state.items() if str(k).replace("module.", "") == key)
-        if raw.ndim != 4 or raw.shape[2:] != (1, 1):
+    for key in _CONVOLUTIONS:
+        if len(shapes[key]) != 4 or shapes[key][2:] != (1, 1):
             raise ModelError(
-                f"{source}: {key} has shape {tuple(raw.shape)}; allowed: a 1x1 convolution (outputs, inputs, 1, 1)"
+                f"{source}: {key} has shape {tuple(shapes[key])}; allowed: a 1x1 convolution (outputs, inputs, 1, 1)"
             )
     pcs = content.get("num_pcs")
-    outputs = tensors["global_projection.bias"].numel()
+    outputs = tensors["global_projection.bias"].size
     if pcs is not None and (not isinstance(pcs, int) or pcs != outputs):
         raise ModelError(f"{source}: num_pcs says {pcs!r} but WPCA.0.bias has {outputs} entries")
     return tensors

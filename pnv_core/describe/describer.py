@@ -1,25 +1,19 @@
 """Describer: an image to a PlaceDescriptor. D dimensions, P patch sizes."""
 
-import copy
 import hashlib
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from pnv_core import kernels
 from pnv_core.config import Config
 from pnv_core.describe.checkpoints import load_checkpoint
-from pnv_core.describe.download import resolve_weights
-from pnv_core.describe.model_files import Model, load_model
-from pnv_core.describe.patches import PatchAggregator, patch_descriptors
-from pnv_core.describe.trunks.trunk import Trunk
-from pnv_core.errors import ConfigError, ImageError
-from pnv_core.threads import workers
+from pnv_core.describe.download import cache_folder, resolve_weights
+from pnv_core.describe.model_files import Model, load_model, save_model
+from pnv_core.errors import ConfigError, ImageError, ModelError
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
 _TEXTURE_PX = 16  # side of the squares that count as textured or not
@@ -43,9 +37,65 @@ def describer_from(config: Config) -> "Describer":
 
 
 def read_model(path: Path) -> Model:
-    """A model file, or an official checkpoint (.pth.tar, .pth, .pt)."""
-    official = path.name.endswith((".pth.tar", ".pth", ".pt"))
-    return load_checkpoint(path) if official else load_model(path)
+    """A model file, or an official checkpoint (.pth.tar, .pth, .pt).
+
+    A checkpoint is kept as a model file in the cache folder; the next start then needs no torch.
+    """
+    if not path.name.endswith((".pth.tar", ".pth", ".pt")):
+        return load_model(path)
+    try:
+        state = path.stat()
+    except OSError:
+        return load_checkpoint(path)  # which says what is wrong
+    key = hashlib.sha256(f"{path.resolve()} {state.st_size} {state.st_mtime_ns}".encode()).hexdigest()[:16]
+    converted = cache_folder() / "converted" / f"{key}.safetensors"
+    if converted.exists():
+        try:
+            return load_model(converted)
+        except ModelError:
+            pass  # damaged: it is made again
+    model = load_checkpoint(path)
+    try:
+        converted.parent.mkdir(parents=True, exist_ok=True)
+        save_model(model, converted)
+    except OSError:
+        pass  # a home that cannot be written to costs time, nothing else
+    return model
+
+
+class Describing(Protocol):
+    """What computes descriptors: a model at one image size, in one library."""
+
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+
+    def describe(
+        self, pixels: NDArray[np.uint8], cells: NDArray[np.float32] | None = None
+    ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]: ...
+
+
+def backend_of(config: Config) -> str:
+    """'openvino' or 'torch', as the Config asks for. Raises ConfigError where device and backend exclude each other."""
+    if config.backend == "auto":
+        if config.device == "cpu":
+            return "openvino"
+        from pnv_core.describe.torch_model import torch_device
+
+        return "torch" if torch_device(config.device).type == "cuda" else "openvino"
+    if config.backend == "openvino" and config.device == "cuda":
+        raise ConfigError("backend = 'openvino' runs on the processor; allowed with device = 'cuda': torch, auto")
+    return config.backend
+
+
+def _describing(model: Model, config: Config) -> Describing:
+    windows = list(zip(config.patch_sizes, config.patch_strides, strict=True))
+    if backend_of(config) == "torch":
+        from pnv_core.describe.torch_model import TorchDescribing, torch_device  # seconds to import
+
+        return TorchDescribing(model, windows, config.threads, config.trunk_precision, torch_device(config.device))
+    from pnv_core.describe.openvino_describing import OpenVinoDescribing
+
+    size, cache = (config.image_width, config.image_height), cache_folder() / "openvino"
+    return OpenVinoDescribing(model, size, windows, config.threads, config.trunk_precision, cache)
 
 
 class Describer:
@@ -53,31 +103,10 @@ class Describer:
 
     def __init__(self, model: Model, config: Config | None = None) -> None:
         self.config = _completed(config or Config(), model)
-        self.device = _device(self.config.device)
         self.model = model
-        for module in (
-            model.trunk,
-            model.netvlad,
-            model.global_projection,
-            model.patch_projection,
-            model.pooled_projection,
-        ):
-            if module is not None:
-                module.to(self.device)
-        self.trunk = _running(model.trunk, self.config.trunk_precision)
-        if self.config.threads:
-            torch.set_num_threads(self.config.threads)
-        self.aggregator = self._aggregator()
+        self.backend = backend_of(self.config)
         self.fingerprint = model.fingerprint()
-
-    def _aggregator(self) -> PatchAggregator | None:
-        """None where the plain formulation on the device serves instead."""
-        if self.device.type != "cpu" or not kernels.COMPILED:
-            return None
-        projection = self.model.patches_projection
-        pool = workers(self.config.threads)
-        fast = self.config.patch_mode == "fast"
-        return PatchAggregator(self.model.netvlad.centroids, projection.weight, projection.bias, pool, fast)
+        self._describing = _describing(model, self.config)
 
     @property
     def cell(self) -> int:
@@ -94,9 +123,14 @@ class Describer:
         """Of everything that descriptors must share to be compared: the model, the image size and the patch grids."""
         return hashlib.sha256(f"{self.fingerprint} {self.image_size} {self.grids()}".encode()).hexdigest()
 
+    @property
+    def cells(self) -> tuple[int, int]:
+        """(rows, columns) of the feature map."""
+        return self.config.image_height // self.cell, self.config.image_width // self.cell
+
     def grids(self) -> list[tuple[int, int, int, int]]:
         """(size, stride, rows, cols) per patch size."""
-        h, w = self.config.image_height // self.cell, self.config.image_width // self.cell
+        h, w = self.cells
         pairs = zip(self.config.patch_sizes, self.config.patch_strides, strict=True)
         return [(p, s, (h - p) // s + 1, (w - p) // s + 1) for p, s in pairs]
 
@@ -107,45 +141,17 @@ class Describer:
         Raises ImageError for any other array.
         """
         pixels = resized(checked_image(rgb), *self.image_size)
-        with torch.inference_mode():
-            features, wide = self.maps(pixels)
-            x, weights = self.model.netvlad.soft_assign(features)
-            cells = None
-            if valid is not None:
-                cells = torch.from_numpy(_valid_cells(valid, features.shape[-2:])).to(weights)
-                weights, cells = weights * cells, cells[0]
-            vector = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide, cells)[0]
-            arrays = self._patches(x[0], weights[0], (features.shape[-2], features.shape[-1]))
-            patches = tuple(
-                PatchGrid(size, rows, cols, array, stride, self.cell)
-                for array, (size, stride, rows, cols) in zip(arrays, self.grids(), strict=True)
-            )
-            return PlaceDescriptor(vector.cpu().numpy(), patches, texture(pixels, valid))
+        cells = None if valid is None else _valid_cells(valid, self.cells)
+        vector, arrays = self._describing.describe(pixels, cells)
+        patches = tuple(
+            PatchGrid(size, rows, cols, array, stride, self.cell)
+            for array, (size, stride, rows, cols) in zip(arrays, self.grids(), strict=True)
+        )
+        return PlaceDescriptor(vector, patches, texture(pixels, valid))
 
-    def _patches(self, x: torch.Tensor, weights: torch.Tensor, shape: tuple[int, int]) -> list[NDArray[np.float32]]:
-        sizes, strides = self.config.patch_sizes, self.config.patch_strides
-        if self.aggregator is not None:
-            return self.aggregator(x, weights, shape, sizes, strides)
-        projection, centroids = self.model.patches_projection, self.model.netvlad.centroids
-        arrays = patch_descriptors(x, weights, centroids, projection.weight, projection.bias, shape, sizes, strides)
-        return [array.cpu().numpy() for array in arrays]
-
-    def maps(self, pixels: NDArray[np.uint8]) -> tuple[torch.Tensor, torch.Tensor]:
-        """(H, W, 3) uint8 of the configured size -> the trunk's maps (1, C, h, w) and (1, W, h, w)."""
-        images = torch.from_numpy(pixels).to(self.device).permute(2, 0, 1)[None].float() / 255.0
-        features, wide = self.trunk.maps(images.contiguous(memory_format=torch.channels_last))
-        return features.float(), wide.float()
-
-
-def _running(trunk: Trunk, precision: str) -> Trunk:
-    """The trunk as it runs: channels last, in the precision asked for, the normalisation of its input in float32."""
-    trunk = copy.deepcopy(trunk).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    normalisation = getattr(trunk, "input", None)
-    if precision == "bfloat16" and normalisation is not None:
-        trunk.bfloat16()
-        normalisation.float()
-        normalisation.register_forward_hook(lambda module, inputs, output: output.bfloat16())
-    return trunk
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(H, W, 3) uint8 of the configured size -> the trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+        return self._describing.maps(pixels)
 
 
 def checked_image(rgb: Any) -> NDArray[np.uint8]:
@@ -159,8 +165,8 @@ def checked_image(rgb: Any) -> NDArray[np.uint8]:
 def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
     """Bilinear with anti-aliasing and 8-bit rounding, as the reference resizes (Pillow)."""
     if rgb.shape[:2] == (height, width):
-        return rgb.copy()  # callers may hand in read-only message buffers, which torch refuses
-    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR)).copy()
+        return rgb
+    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def texture(pixels: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> float:
@@ -172,14 +178,14 @@ def texture(pixels: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -
     textured = square - mean * mean > _FLAT_CELL_STD**2
     if valid is None:
         return float(textured.mean())
-    seen = _valid_cells(valid, (h, w)).reshape(h, w) > 0.0
+    seen = _valid_cells(valid, (h, w)) > 0.0
     return float(textured[seen].mean()) if seen.any() else 0.0
 
 
-def _valid_cells(valid: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """(H, W) bool -> (1, 1, h * w) share of valid pixels, cells less than half valid cut to 0."""
+def _valid_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """(H, W) bool -> (h, w) share of valid pixels, cells less than half valid cut to 0."""
     share = cv2.resize(valid.astype(np.float32), (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
-    return np.where(share < 0.5, 0.0, share).astype(np.float32).reshape(1, 1, -1)
+    return np.where(share < 0.5, 0.0, share).astype(np.float32)
 
 
 def _completed(config: Config, model: Model) -> Config:
@@ -205,11 +211,3 @@ def _completed(config: Config, model: Model) -> Config:
             f"allowed: 1 to {cells}"
         )
     return done
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device = 'cuda' but torch sees no CUDA device; allowed here: cpu, auto")
-    return torch.device(name)

@@ -4,12 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.threads import workers
 from pnv_core.types import PatchMatches, PlaceDescriptor
-from pnv_core.verify.matching import Indices, PatchRows, mutual_nearest_rows, patch_rows
+from pnv_core.verify.matching import Indices, mutual_nearest_rows, patch_rows
 from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score, scale_change
+
+Rows = NDArray[np.float32]  # patch descriptors made ready for matching
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +47,7 @@ class Reranker:
         rows = _rows(query)
         return self.workers.map(lambda reference: self._score(query, rows, reference), references)
 
-    def _score(self, query: PlaceDescriptor, rows: Sequence[PatchRows], reference: PlaceDescriptor) -> SpatialResult:
+    def _score(self, query: PlaceDescriptor, rows: Sequence[Rows], reference: PlaceDescriptor) -> SpatialResult:
         return self._verified(query, reference, _matches(rows, reference))
 
     def _verified(self, query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[tuple]) -> SpatialResult:
@@ -66,10 +69,10 @@ class Reranker:
         return SpatialResult(fused, tuple(scores), tuple(found), counted)
 
 
-def _rows(descriptor: PlaceDescriptor) -> list[PatchRows]:
+def _rows(descriptor: PlaceDescriptor) -> list[Rows]:
     return [patch_rows(grid.descriptors) for grid in descriptor.patches]
 
 
-def _matches(query: Sequence[PatchRows], reference: PlaceDescriptor) -> list[tuple[Indices, Indices]]:
+def _matches(query: Sequence[Rows], reference: PlaceDescriptor) -> list[tuple[Indices, Indices]]:
     pairs = zip(query, reference.patches, strict=True)
     return [mutual_nearest_rows(rows, patch_rows(grid.descriptors)) for rows, grid in pairs]

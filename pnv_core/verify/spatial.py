@@ -3,21 +3,17 @@
 import math
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core import kernels
 from pnv_core.types import PatchGrid, PatchMatches
+from pnv_core.verify.homography import homography_inliers
 
 RANSAC_TOLERANCE_CELLS = 1.5  # the authors' code: 1.5 strides, 24 px (the paper prints one stride)
 MIN_MATCHES = 4  # a homography needs four points
-_MOST_SAMPLES, _CONFIDENCE = 2000, 0.995  # OpenCV's defaults, which the authors' code takes
 _SCALE_INLIERS = 8  # with fewer the slope is mostly noise
 _SCALE_TOLERANCE = 0.1  # of |log scale|; ten per cent nearer or farther is another place in a row of keyframes
 _SMALLEST_SLOPE = 0.05
-# From this release on findHomography gives the inliers of the refined homography (OpenCV issue 25546).
-_REFINED = tuple(int(part) for part in cv2.__version__.split(".")[:2]) >= (4, 12)
 
 
 def ransac_score(
@@ -35,30 +31,6 @@ def ransac_score(
     target = query.keypoints()[q].astype(np.float32)
     inlier = homography_inliers(source, target, tolerance)
     return float(inlier.sum()) / (query.rows * query.cols), inlier
-
-
-def homography_inliers(source: NDArray[np.float32], target: NDArray[np.float32], tolerance: float) -> NDArray[np.bool_]:
-    """(M, 2) each, M >= 4, pixels -> (M,): the inliers of cv2.findHomography with RANSAC, found faster.
-
-    Only the search is our own; refinement is OpenCV's.
-    """
-    if not kernels.COMPILED or len(source) == MIN_MATCHES:
-        return _opencv_inliers(source, target, tolerance)
-    inlier = kernels.ransac_homography(source, target, tolerance, _MOST_SAMPLES, _CONFIDENCE)
-    if not _REFINED or not inlier.any():
-        return inlier
-    refined, _ = cv2.findHomography(source[inlier], target[inlier], 0)
-    if refined is None:
-        return _opencv_inliers(source, target, tolerance)
-    model = refined.astype(np.float32).ravel()[:8]
-    limit = np.float32(tolerance * tolerance)
-    kernels.transfer_inliers(model, source[:, 0], source[:, 1], target[:, 0], target[:, 1], limit, inlier)
-    return inlier
-
-
-def _opencv_inliers(source: NDArray[np.float32], target: NDArray[np.float32], tolerance: float) -> NDArray[np.bool_]:
-    _, mask = cv2.findHomography(source, target, cv2.RANSAC, tolerance)
-    return np.zeros(len(source), bool) if mask is None else mask.ravel().astype(bool)
 
 
 def rapid_spatial_score(

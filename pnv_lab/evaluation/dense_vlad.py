@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import resized
-from pnv_core.describe.model_files import Model, ModelInfo, save_model
+from pnv_core.describe.model_files import ModelInfo, save_model
 from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule
-from pnv_core.describe.trunks import TRUNKS
-from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.describe.torch_model import TorchModel, TorchTrunk
+from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.images import read_image
 from pnv_lab.evaluation.extraction import Progress
 from pnv_lab.evaluation.extractors import multiscale_vlad
@@ -40,25 +40,25 @@ def fitted_dense_vlad(references: Sequence[Path], completed: Config, cache: Path
     if target.is_file():
         return target
     target.parent.mkdir(parents=True, exist_ok=True)
-    trunk = TRUNKS.make("rootsift")
+    trunk = TorchTrunk(rootsift_trunk())
 
     def shown(items: Iterable[Path], what: str) -> Iterable[Path]:
         return progress(items, len(files), f"DenseVLAD: {what}")
 
     vocabulary = _vocabulary(trunk, (resized(read_image(f), *size) for f in shown(files, "vocabulary")))
     info = ModelInfo("rootsift", image_width=size[0], image_height=size[1], patch_sizes=(2,), patch_weights=(1.0,))
-    model = Model(info, trunk, vocabulary, Projection(_CLUSTERS * trunk.channels, 1))
+    model = TorchModel(info, trunk, vocabulary, Projection(_CLUSTERS * trunk.channels, 1))
     vlads = torch.stack([multiscale_vlad(model, read_image(f), size) for f in shown(files, "PCA")])
     dimensions = max(1, min(_DIMENSIONS, len(files) - 1))
     projection = Projection(vlads.shape[1], dimensions)
     if len(files) > 1:
         weight, bias = pca(vlads, dimensions, whiten=len(files) >= _PER_DIMENSION * dimensions)
         projection.load_state_dict({"weight": weight, "bias": bias})
-    save_model(Model(info, trunk, vocabulary, projection), target)
+    save_model(TorchModel(info, trunk, vocabulary, projection).model(), target)
     return target
 
 
-def _vocabulary(trunk: Trunk, images: Iterable[NDArray[np.uint8]]) -> NetVLAD:
+def _vocabulary(trunk: TorchTrunk, images: Iterable[NDArray[np.uint8]]) -> NetVLAD:
     """Clusters of local descriptors drawn from the images, with NetVLAD's assignment."""
     generator = torch.Generator().manual_seed(0)
     drawn = []

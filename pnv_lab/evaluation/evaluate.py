@@ -145,7 +145,7 @@ class Evaluation:
 
     def _shared_projection(self, describing: Describing) -> bool:
         describer = getattr(describing.extractor, "describer", None)
-        return describer is None or describer.model.patch_projection is None
+        return describer is None or not describer.model.has("patch_projection")
 
     def _depth(self, dataset: Dataset) -> int:
         if dataset.groups is None:

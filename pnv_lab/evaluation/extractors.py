@@ -14,8 +14,8 @@ from torch import Tensor
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer, checked_image, describer_from, resized, texture
-from pnv_core.describe.model_files import Model
 from pnv_core.describe.netvlad import gem
+from pnv_core.describe.torch_model import TorchModel
 from pnv_core.errors import ConfigError
 from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_lab.evaluation.extraction import Extractor, Record, descriptor_record
@@ -56,20 +56,21 @@ class PooledPatches(_Describing):
 
     def __init__(self, kind: str, config: Config) -> None:
         super().__init__(config)
+        self.model = TorchModel.of(self.describer.model)
         self.pool: Callable[..., Tensor] = F.avg_pool2d if kind == "average" else F.max_pool2d
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         pixels = self.pixels(rgb)
         with torch.inference_mode():
-            features, wide = self.describer.maps(pixels)
-            vector = self.describer.model.global_vector(self.describer.model.netvlad(features), wide)[0]
+            features, wide = (torch.from_numpy(maps)[None] for maps in self.describer.maps(pixels))
+            vector = self.model.global_vector(self.model.netvlad(features), wide)[0]
             patches = []
             for size, stride, rows, cols in self.describer.grids():
                 pooled = self.pool(features, size, stride)[0].flatten(1).T  # (rows * cols, C)
                 patches.append(
-                    PatchGrid(size, rows, cols, F.normalize(pooled, dim=1).cpu().numpy(), stride, self.describer.cell)
+                    PatchGrid(size, rows, cols, F.normalize(pooled, dim=1).numpy(), stride, self.describer.cell)
                 )
-        descriptor = PlaceDescriptor(vector.cpu().numpy(), tuple(patches), texture(pixels))
+        descriptor = PlaceDescriptor(vector.numpy(), tuple(patches), texture(pixels))
         return descriptor_record(descriptor, self.precision)
 
 
@@ -78,10 +79,11 @@ class GeM(_Describing):
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         with torch.inference_mode():
-            return {"global": gem(self.describer.maps(self.pixels(rgb))[1])[0].cpu().numpy()}
+            wide = torch.from_numpy(self.describer.maps(self.pixels(rgb))[1])
+            return {"global": gem(wide[None])[0].numpy()}
 
 
-def multiscale_vlad(model: Model, rgb: NDArray[np.uint8], size: tuple[int, int]) -> Tensor:
+def multiscale_vlad(model: TorchModel, rgb: NDArray[np.uint8], size: tuple[int, int]) -> Tensor:
     """(K * C,) VLAD of dense RootSIFT at DenseVLAD's four scales; `size` is the (width, height) of scale one."""
     total = None
     for bin_px in SIFT_BINS_PX:
@@ -103,12 +105,13 @@ class DenseVLAD:
         trunk = self.describer.model.info.trunk
         if trunk != "rootsift":
             raise ConfigError(f"densevlad needs a model of trunk rootsift; {config.weights} has {trunk}")
+        self.model = TorchModel.of(self.describer.model)
         self.fingerprint = fingerprint(self.describer)
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         with torch.inference_mode():
-            vlad = multiscale_vlad(self.describer.model, checked_image(rgb), self.describer.image_size)
-            return {"global": self.describer.model.global_projection(vlad).numpy()}
+            vlad = multiscale_vlad(self.model, checked_image(rgb), self.describer.image_size)
+            return {"global": self.model.global_projection(vlad).numpy()}
 
 
 class LocalFeatures:

@@ -6,13 +6,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from pnv_core.describe.model_files import Model, ModelInfo
-from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.describe.model_files import ModelInfo
+from pnv_core.describe.torch_model import TorchModel, TorchTrunk
+from pnv_core.describe.trunks.compact import compact_trunk
 from pnv_core.errors import ModelError
 from pnv_lab.fit import FitOptions, local_samples, pca, pooled_projection_of, projections_of, vocabulary_of
 
 
-def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> CompactTrunk:
+def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> TorchTrunk:
     """A compact trunk without neck from a torchvision-named SqueezeNet 1.1 file (.pth).
 
     Raises ModelError for a file that holds anything else.
@@ -21,7 +22,7 @@ def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> CompactTrunk:
         tensors = torch.load(weights, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise ModelError(f"{weights}: not a readable tensor file ({error})") from None
-    trunk = CompactTrunk(fires=fires, neck=0, relu=relu)
+    trunk = TorchTrunk(compact_trunk(fires=fires, neck=0, relu=relu))
     try:
         trunk.load_state_dict({name: tensors[name] for name in trunk.state_dict()})
     except (KeyError, TypeError, RuntimeError) as error:
@@ -31,25 +32,25 @@ def imagenet_trunk(weights: Path | str, fires: int, relu: bool) -> CompactTrunk:
 
 @torch.no_grad()
 def initial_model(
-    trunk: CompactTrunk,
+    trunk: TorchTrunk,
     neck: int,
     maps: Callable[[], Iterable[Tensor]],
     layers: int,
     info: ModelInfo,
     options: FitOptions,
-) -> Model:
+) -> TorchModel:
     """An untrained model around an ImageNet trunk, fitted to what its first `layers` gave for some images.
 
     The neck keeps the `neck` leading principal directions of the unit local features. `maps` gives the same maps
     (C', h, w) each time it is called.
     """
-    ends = [trunk.features[layers:](m[None].float())[0] for m in maps()]
+    ends = [trunk.wide(m[None].float(), layers)[0] for m in maps()]
     weight, _ = pca(local_samples(ends, options), neck, whiten=False)
-    whole = CompactTrunk(**info.trunk_options)
-    whole.features.load_state_dict(trunk.features.state_dict())
-    whole.neck.load_state_dict({"weight": weight[:, :, None, None], "bias": torch.zeros(neck)})
-    necks = [whole.neck(end[None]) for end in ends]
+    whole = TorchTrunk(compact_trunk(**info.trunk_options))
+    neck_state = {"neck.weight": weight[:, :, None, None], "neck.bias": torch.zeros(neck)}
+    whole.load_state_dict(trunk.state_dict() | neck_state)
+    necks = [whole.run(end[None], len(whole.trunk.layers)) for end in ends]
     netvlad = vocabulary_of(necks, options)
     vlads, patches = projections_of(netvlad, necks, options)
     pooled = pooled_projection_of(ends, options)
-    return Model(info, whole, netvlad, vlads, patches, pooled)
+    return TorchModel(info, whole, netvlad, vlads, patches, pooled)

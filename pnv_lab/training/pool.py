@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.files import atomic_write
 from pnv_lab.training.batches import Batch, Origin, PlaceBatches, assembled
 
@@ -31,7 +31,7 @@ class FeaturePool:
         self.places, self.views = places, views
         self.origins: list[list[Origin]] = []
 
-    def build(self, trunk: CompactTrunk, layers: int, progress: Iterable[int] | None = None) -> None:
+    def build(self, trunk: TorchTrunk, layers: int, progress: Iterable[int] | None = None) -> None:
         """Render what is missing and pass it through the first `layers` of the trunk."""
         place = self.folder / self._key(trunk, layers)
         place.mkdir(parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ class FeaturePool:
                 file.write(json.dumps(number + 1).encode())
         self._open(place)
 
-    def _key(self, trunk: CompactTrunk, layers: int) -> str:
+    def _key(self, trunk: TorchTrunk, layers: int) -> str:
         digest = hashlib.sha256(f"{self.batches.options} {self.groups} {layers}".encode())
         for image in self.batches.images:
             digest.update(repr(replace(image, rgb=image.rgb.shape)).encode())  # type: ignore[arg-type]

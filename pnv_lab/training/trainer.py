@@ -17,8 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from pnv_core.describe.model_files import Model
 from pnv_core.describe.netvlad import NetVLAD
+from pnv_core.describe.torch_model import TorchModel
 from pnv_core.errors import ModelError
 from pnv_lab.training.batches import Batch, Batches
 from pnv_lab.training.journal import Journal
@@ -60,7 +60,7 @@ class Trainer:
 
     def __init__(
         self,
-        model: Model,
+        model: TorchModel,
         batches: Batches,
         validation: Sequence[ValidationSet],
         options: TrainOptions,
@@ -94,7 +94,7 @@ class Trainer:
 
     def run(
         self, progress: Callable[[Iterator[Batch], int, int], Iterator[Batch]] = lambda batches, done, total: batches
-    ) -> Model:
+    ) -> TorchModel:
         """Train to the last step and give the model with averaged weights, blended with those it started from."""
         torch.manual_seed(self.options.seed)
         if self.step == 0:
@@ -121,8 +121,8 @@ class Trainer:
     def _freeze(self) -> None:
         for parameter in self.parts.parameters():
             parameter.requires_grad_(True)
-        for layer in list(getattr(self.model.trunk, "features", []))[: self.options.frozen_layers]:
-            layer.requires_grad_(False)
+        for parameter in self.model.trunk.front_parameters(self.options.frozen_layers):
+            parameter.requires_grad_(False)
 
     def _groups(self) -> list[dict[str, Any]]:
         o = self.options
@@ -184,7 +184,7 @@ class Trainer:
                 found = self.model.trunk.maps((inputs.float() / 255).contiguous(memory_format=torch.channels_last))
             else:
                 maps = inputs.float().contiguous(memory_format=torch.channels_last)
-                found = self.model.trunk.back(maps, self.options.frozen_layers)  # type: ignore[operator]
+                found = self.model.trunk.back(maps, self.options.frozen_layers)
         return found[0].float(), found[1].float()
 
     def _patch_loss(self, batch: Batch, x: Tensor, weights: Tensor, shape: tuple[int, int]) -> Tensor:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from pnv_core.describe.netvlad import NetVLAD
-from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.errors import ModelError
 from pnv_lab.fit import as_batch
 from pnv_lab.training.augment import flat_view, relight
@@ -59,7 +59,7 @@ class TripletTrainer:
 
     def __init__(
         self,
-        trunk: Trunk,
+        trunk: TorchTrunk,
         netvlad: NetVLAD,
         images: Sequence[PlaceImage],
         validation: Sequence[ValidationSet],
@@ -74,9 +74,8 @@ class TripletTrainer:
         self.parts = nn.ModuleDict({"trunk": trunk, "netvlad": netvlad}).to(self.device)
         self.parts["trunk"].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.parts.requires_grad_(True)
-        layers: list[nn.Module] = list(getattr(trunk, "features", []))
-        for layer in layers[: options.first_layer]:
-            layer.requires_grad_(False)
+        for parameter in trunk.front_parameters(options.first_layer):
+            parameter.requires_grad_(False)
         trained = [p for p in self.parts.parameters() if p.requires_grad]
         self.optimizer = torch.optim.SGD(
             trained, lr=options.rate, momentum=options.momentum, weight_decay=options.weight_decay

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pnv_core.describe.model_files import Model
+from pnv_core.describe.torch_model import TorchModel
 from pnv_lab.training.augment import Camera, flat_view, panorama_view, relight
 from pnv_lab.training.sources import PlaceImage, relation
 
@@ -67,7 +67,7 @@ def recalls(
 
 
 @torch.inference_mode()
-def describe_all(model: Model, images: NDArray[np.uint8], device: torch.device, mixed: bool) -> Tensor:
+def describe_all(model: TorchModel, images: NDArray[np.uint8], device: torch.device, mixed: bool) -> Tensor:
     """(n, H, W, 3) uint8 -> global descriptors (n, D)."""
     found = []
     for start in range(0, len(images), 32):

@@ -5,27 +5,25 @@ import torch
 
 from pnv_core.config import Config
 from pnv_core.describe.describer import Describer
-from pnv_core.describe.model_files import Model, ModelInfo
-from pnv_core.describe.netvlad import NetVLAD, Projection
-from pnv_core.describe.trunks import TRUNKS
+from pnv_core.describe.model_files import Model, ModelInfo, build_model
+from pnv_core.describe.trunks.rootsift import rootsift_trunk
 
 WIDTH, HEIGHT = 192, 160
 
 
 def small_model(seed: int = 0, clusters: int = 4, dim: int = 32) -> Model:
     generator = torch.Generator().manual_seed(seed)
-    trunk = TRUNKS.make("rootsift")
-    netvlad = NetVLAD(clusters, trunk.channels)
-    netvlad.centroids.data = torch.rand(clusters, trunk.channels, generator=generator) * 0.1
-    netvlad.assignment.data = torch.randn(clusters, trunk.channels, generator=generator) * 5
-    projection = Projection(clusters * trunk.channels, dim)
-    projection.weight.data = torch.randn(dim, clusters * trunk.channels, generator=generator) * 0.05
+    channels = rootsift_trunk().channels
+    tensors = {
+        "netvlad.centroids": torch.rand(clusters, channels, generator=generator) * 0.1,
+        "netvlad.assignment": torch.randn(clusters, channels, generator=generator) * 5,
+        "global_projection.weight": torch.randn(dim, clusters * channels, generator=generator) * 0.05,
+        "global_projection.bias": torch.zeros(dim),
+    }
     info = ModelInfo(
         trunk="rootsift", image_width=WIDTH, image_height=HEIGHT, patch_sizes=(2, 5), patch_weights=(0.5, 0.5)
     )
-    for module in (trunk, netvlad, projection):
-        module.eval().requires_grad_(False)
-    return Model(info, trunk, netvlad, projection)
+    return build_model(info, {name: tensor.numpy() for name, tensor in tensors.items()}, "small model")
 
 
 def small_describer(**settings: object) -> Describer:

@@ -1,109 +1,127 @@
-"""The fast formulations against their definitions: float64, OpenCV, brute force, and the plain path without kernels."""
+"""The fast formulations against their definitions: float64, OpenCV, brute force, the plain formulation in torch."""
+
+import os
+import subprocess
+import sys
 
 import cv2
 import numpy as np
 import pytest
+import threadpoolctl
 import torch
 import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnv_core import kernels
-from pnv_core.describe.patches import PatchAggregator, bfloat16_is_fast, patch_descriptors
+from pnv_core import load_describer
+from pnv_core.describe.model_files import ModelInfo, build_model
+from pnv_core.describe.openvino_describing import head
+from pnv_core.describe.patches import patch_descriptors
+from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.errors import ConfigError
+from pnv_core.networks.openvino_backend import Compiled, fast_precisions
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.threads import spans, workers
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, Reason
-from pnv_core.verify import matching, spatial
+from pnv_core.verify.homography import homography_inliers
 from pnv_core.verify.matching import mutual_nearest, patch_rows
 from pnv_core.verify.reranker import Reranker
-from pnv_core.verify.spatial import homography_inliers
 from test.core.small import HEIGHT, WIDTH, small_describer
-
-compiled = pytest.mark.skipif(not kernels.COMPILED, reason="numba is not installed")
 
 
 def local_descriptors(seed, clusters, channels, dim, shape, sharpness):
+    """Features (C, h, w) and a model's tensors around them."""
     rng = torch.Generator().manual_seed(seed)
-    x = F.normalize(torch.randn(channels, shape[0] * shape[1], generator=rng) + 0.5, dim=0)
+    features = torch.randn(channels, *shape, generator=rng) + 0.5
     centroids = F.normalize(torch.randn(clusters, channels, generator=rng) + 0.5, dim=1) * 0.8
-    weights = torch.softmax(sharpness * centroids @ x, dim=0)
-    return x, weights, centroids, torch.randn(dim, clusters * channels, generator=rng), torch.randn(dim, generator=rng)
+    return features, {
+        "netvlad.centroids": centroids,
+        "netvlad.assignment": sharpness * centroids,
+        "global_projection.weight": torch.randn(dim, clusters * channels, generator=rng),
+        "global_projection.bias": torch.randn(dim, generator=rng),
+    }
 
 
-@compiled
-@settings(deadline=None, max_examples=25)
+def aggregated(features, tensors, windows, counted=None):
+    """The patches of the OpenVINO graph."""
+    channels = features.shape[0]
+    trunk = {"neck.weight": np.zeros((channels, 384, 1, 1)), "neck.bias": np.zeros(channels)}
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()} | {f"trunk.{n}": t for n, t in trunk.items()}
+    shapes = compact_trunk(neck=channels).tensor_shapes()
+    arrays |= {f"trunk.{name}": np.zeros(shape) for name, shape in shapes.items() if f"trunk.{name}" not in arrays}
+    model = build_model(ModelInfo("compact", {"neck": channels}), arrays, "test")
+    cells = features.shape[1:]
+    counted = np.ones((1, 1, *cells), np.float32) if counted is None else counted
+    wide = np.zeros((1, model.trunk.width, *cells), np.float32)
+    return Compiled(lambda: head(model, cells, windows), 1)(features.numpy()[None], wide, counted)[1:]
+
+
+def defined(features, tensors, windows, counted=None):
+    """The definition in float64."""
+    centroids, assignment, projection, bias = (t.double() for t in tensors.values())
+    x = F.normalize(features.double().flatten(1), dim=0)
+    weights = torch.softmax(assignment @ x, dim=0)
+    if counted is not None:
+        weights = weights * torch.from_numpy(counted.ravel()).double()
+    sizes, strides = zip(*windows, strict=True)
+    shape = tuple(features.shape[1:])
+    return [rows.numpy() for rows in patch_descriptors(x, weights, centroids, projection, bias, shape, sizes, strides)]
+
+
+@settings(deadline=None, max_examples=15)
 @given(
     seed=st.integers(0, 999),
     clusters=st.integers(1, 7),
     channels=st.integers(2, 40),
-    dim=st.integers(1, 150),
+    dim=st.integers(1, 40),
     height=st.integers(6, 11),
     width=st.integers(6, 13),
     sharpness=st.sampled_from([1.0, 30.0, 200.0]),
-    windows=st.lists(st.tuples(st.integers(1, 6), st.integers(1, 3)), min_size=1, max_size=4),
-    threads=st.integers(1, 3),
+    windows=st.lists(st.tuples(st.integers(1, 6), st.integers(1, 3)), min_size=1, max_size=3),
 )
 def test_aggregated_patches_equal_the_definition_in_float64(
-    seed, clusters, channels, dim, height, width, sharpness, windows, threads
+    seed, clusters, channels, dim, height, width, sharpness, windows
 ):
-    x, weights, centroids, projection, bias = local_descriptors(
-        seed, clusters, channels, dim, (height, width), sharpness
-    )
-    sizes, strides = zip(*windows, strict=True)
-    given_rows = PatchAggregator(centroids, projection, bias, workers(threads))(
-        x, weights, (height, width), sizes, strides
-    )
-    exact = patch_descriptors(
-        *(v.double() for v in (x, weights, centroids, projection, bias)), (height, width), sizes, strides
-    )
-    for rows, expected in zip(given_rows, exact, strict=True):
-        assert rows.shape == tuple(expected.shape)
-        assert np.abs(rows - expected.numpy()).max() < 2e-5
+    features, tensors = local_descriptors(seed, clusters, channels, dim, (height, width), sharpness)
+    for rows, expected in zip(aggregated(features, tensors, windows), defined(features, tensors, windows), strict=True):
+        assert rows.shape == expected.shape
+        assert np.abs(rows - expected).max() < 2e-5
 
 
-@compiled
 def test_windows_whose_residuals_cancel_keep_their_direction():
     """Two descriptors on opposite sides of a centroid leave a residual a thousand times smaller than either."""
-    channels, shape = 8, (4, 4)
+    channels, size = 8, (4, 4)
     centroid = torch.full((1, channels), 0.3)
     step = torch.zeros(channels, 16)
     step[0] = torch.tensor([0.5, -0.5] * 8)
     step[1] = 1e-3
-    x = centroid.T + step
-    projection = torch.eye(channels)
-    rows = PatchAggregator(centroid, projection, torch.zeros(channels), workers(1))(
-        x, torch.ones(1, 16), shape, (2,), (1,)
-    )[0]
-    assert np.abs(rows[:, 1] - 1).max() < 1e-3
+    features = (centroid.T + step).view(channels, *size)
+    lengths = features.norm(dim=0).mean()  # the graph makes them unit; the columns are nearly equally long
+    tensors = {
+        "netvlad.centroids": centroid / lengths,
+        "netvlad.assignment": torch.zeros(1, channels),
+        "global_projection.weight": torch.eye(channels),
+        "global_projection.bias": torch.zeros(channels),
+    }
+    windows = [(2, 1)]
+    (rows,), (expected,) = aggregated(features, tensors, windows), defined(features, tensors, windows)
+    assert np.abs(rows - expected).max() < 1e-3
 
 
-@compiled
 def test_patches_that_no_cluster_touches_are_zero():
-    x, weights, centroids, projection, bias = local_descriptors(1, 4, 16, 24, (8, 9), 10.0)
-    weights.view(4, 8, 9)[:, :, :5] = 0
-    fast = PatchAggregator(centroids, projection, bias, workers(2))(x, weights, (8, 9), (2, 3), (1, 1))
-    plain = patch_descriptors(x, weights, centroids, projection, bias, (8, 9), (2, 3), (1, 1))
-    for rows, expected in zip(fast, plain, strict=True):
-        assert np.array_equal(~rows.any(1), ~expected.numpy().any(1))
+    features, tensors = local_descriptors(1, 4, 16, 24, (8, 9), 10.0)
+    counted = np.ones((1, 1, 8, 9), np.float32)
+    counted[:, :, :, :5] = 0
+    windows = [(2, 1), (3, 1)]
+    for rows, expected in zip(
+        aggregated(features, tensors, windows, counted), defined(features, tensors, windows, counted), strict=True
+    ):
+        assert np.array_equal(~rows.any(1), ~expected.any(1))
         assert (~rows.any(1)).sum() > 10
-        assert np.allclose(rows, expected.numpy(), atol=1e-5)
+        assert np.allclose(rows, expected, atol=1e-5)
 
 
-@compiled
-@pytest.mark.skipif(not bfloat16_is_fast(), reason="the processor has no bfloat16 products")
-def test_fast_patches_are_nearly_the_exact_ones():
-    x, weights, centroids, projection, bias = local_descriptors(2, 16, 128, 64, (15, 20), 40.0)
-    exact, fast = (
-        PatchAggregator(centroids, projection, bias, workers(2), mode)(x, weights, (15, 20), (2, 5), (1, 1))
-        for mode in (False, True)
-    )
-    for a, b in zip(exact, fast, strict=True):
-        assert (1 - (a * b).sum(1)).max() < 1e-4
-        assert not np.array_equal(a, b)
-
-
-@compiled
 @settings(deadline=None, max_examples=150)
 @given(
     seed=st.integers(0, 10**6),
@@ -153,40 +171,55 @@ def test_screened_matches_are_the_exact_ones(seed, shape, dim, closeness, half):
         assert min(gaps) < 1e-6
 
 
-@compiled
 def test_halves_are_unpacked_to_the_bit():
     values = np.arange(2**16, dtype=np.uint16).view(np.float16)
     finite = values[np.isfinite(values)].reshape(-1, 2)
-    assert np.array_equal(patch_rows(finite).rows.view(np.uint32), finite.astype(np.float32).view(np.uint32))
+    assert np.array_equal(patch_rows(finite).view(np.uint32), finite.astype(np.float32).view(np.uint32))
 
 
-def test_the_plain_path_gives_the_same_descriptor_and_scores(monkeypatch):
-    image = np.random.default_rng(5).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    fast = small_describer()
-    descriptor = fast.describe(image)
-    matches = Reranker(fast.config).score(descriptor, descriptor)
-    monkeypatch.setattr(kernels, "COMPILED", False)
-    monkeypatch.setattr(matching, "_QUANTISED", False)
-    assert spatial.kernels is kernels
-    plain = small_describer()
-    assert plain.aggregator is None
-    other = plain.describe(image)
-    for a, b in zip(descriptor.patches, other.patches, strict=True):
-        assert np.abs(a.descriptors - b.descriptors).max() < 1e-5
-    assert Reranker(plain.config).score(other, other).score == pytest.approx(matches.score, abs=1e-6)
+@pytest.mark.parametrize("settings", [{}, {"image_width": 650, "image_height": 490, "patch_sizes": (2, 5)}])
+def test_both_backends_describe_alike(settings):
+    """Whatever the size, with a mask or without."""
+    image = cv2.resize(np.random.default_rng(5).integers(0, 256, (30, 40, 3), np.uint8), (640, 480))
+    valid = np.ones((480, 640), bool)
+    valid[:300] = False
+    plain, fast = load_describer(backend="torch", **settings), load_describer(**settings)
+    assert (plain.backend, fast.backend) == ("torch", "openvino")
+    assert plain.map_fingerprint == fast.map_fingerprint
+    for mask in (None, valid):
+        a, b = plain.describe(image, mask), fast.describe(image, mask)
+        assert np.abs(a.global_vector - b.global_vector).max() < 1e-5
+        for p, q in zip(a.patches, b.patches, strict=True):
+            assert np.abs(p.descriptors - q.descriptors).max() < 1e-5
 
 
-@pytest.mark.skipif(not bfloat16_is_fast(), reason="the processor has no bfloat16 products")
-def test_a_bfloat16_trunk_describes_alike_and_leaves_the_model_as_it_was():
-    from pnv_core import load_describer
-
+@pytest.mark.parametrize("backend", ["torch", "openvino"])
+def test_a_bfloat16_trunk_describes_alike(backend):
+    if "BF16" not in fast_precisions():
+        pytest.skip("the processor has no bfloat16 products")
     image = cv2.resize(np.random.default_rng(6).integers(0, 256, (30, 40, 3), np.uint8), (320, 240))
-    one, other = load_describer(), load_describer(trunk_precision="bfloat16")
+    one, other = load_describer(backend=backend), load_describer(backend=backend, trunk_precision="bfloat16")
     a, b = one.describe(image), other.describe(image)
     assert 1 - a.global_vector @ b.global_vector < 3e-2
     assert not np.array_equal(a.global_vector, b.global_vector)
     assert one.fingerprint == other.fingerprint
-    assert all(p.dtype == torch.float32 for p in other.model.trunk.parameters())
+
+
+def test_what_was_compiled_and_damaged_is_compiled_again(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    image = np.random.default_rng(8).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    expected = small_describer().describe(image).global_vector
+    (kept,) = (tmp_path / "pnv_ros" / "openvino").iterdir()
+    whole = kept.read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"", whole[:-9] + b"?" + whole[-8:]):
+        kept.write_bytes(damaged)
+        assert np.array_equal(small_describer().describe(image).global_vector, expected)
+        assert len(kept.read_bytes()) == len(whole)
+
+
+def test_openvino_on_cuda_is_refused():
+    with pytest.raises(ConfigError, match="backend = 'openvino' runs on the processor"):
+        load_describer(backend="openvino", device="cuda")
 
 
 class Clock:
@@ -240,17 +273,25 @@ def test_candidates_beyond_the_budget_are_reported_as_not_re_ranked():
     assert not any(c.accepted for c in left_out)
 
 
-def test_worker_threads_use_one_torch_thread_and_leave_the_others_theirs():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
+def test_describing_and_working_leave_the_threads_of_the_program_around_them_as_they_were():
+    def counts():
+        return [library["num_threads"] for library in threadpoolctl.threadpool_info()], cv2.getNumThreads()
+
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
     try:
+        found = counts()
+        descriptor = small_describer(threads=2).describe(image)
+        Reranker(small_describer(threads=2).config).scores(descriptor, [descriptor] * 3)
+        assert counts() == found
         pool = workers(3)
-        assert pool.map(lambda _: torch.get_num_threads(), range(6)) == [1] * 6
-        assert torch.get_num_threads() == 2
+        assert pool.map(lambda _: cv2.getNumThreads(), range(6)) == [1] * 6
+        with pytest.raises(ZeroDivisionError):
+            pool.map(lambda part: 1 // part, [1, 0])
+        assert counts() == found
     finally:
-        torch.set_num_threads(before)
-    with pytest.raises(ZeroDivisionError):
-        pool.map(lambda part: 1 // part, [1, 0])
+        cv2.setNumThreads(before)
 
 
 @given(length=st.integers(1, 500), parts=st.integers(1, 9), align=st.sampled_from([1, 16, 64]))
@@ -259,3 +300,27 @@ def test_spans_cover_everything_once(length, parts, align):
     assert [n for a, b in cut for n in range(a, b)] == list(range(length))
     assert len(cut) <= parts
     assert all(a % align == 0 for a, _ in cut)
+
+
+def test_a_robot_imports_neither_torch_nor_a_compiler(tmp_path):
+    """A fresh process that describes, stores, re-ranks and verifies; the second start finds what the first compiled."""
+    program = """
+import sys
+import numpy as np
+from pnv_core import Config, Describer, Frame, PlaceRecognizer, load_describer
+
+recognizer = PlaceRecognizer(load_describer(min_interval_s=0.0, min_change=0.0, exclude_recent_s=10.0))
+for second in (0, 60):
+    image = np.random.default_rng(1).integers(0, 256, (60, 80, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    closures = recognizer.process(Frame(second * 10**9, "front", image))
+assert closures[0].evidence.local_inliers > 20
+print([name for name in ("torch", "numba", "llvmlite", "onnxruntime", "scipy", "nncf") if name in sys.modules])
+"""
+    environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    listings = []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+        assert done.stdout.strip() == "[]", done.stderr
+        listings.append(sorted((p.name, p.stat().st_mtime_ns) for p in tmp_path.rglob("*") if p.is_file()))
+    assert listings[0]
+    assert listings[0] == listings[1]

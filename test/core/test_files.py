@@ -14,15 +14,15 @@ from pnv_core.describe import download as published
 from pnv_core.describe.checkpoints import load_checkpoint
 from pnv_core.describe.describer import Describer
 from pnv_core.describe.model_files import load_model, save_model
-from pnv_core.describe.trunks.vgg16 import VGG16Trunk
+from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.errors import ModelError
 from test.core.small import HEIGHT, WIDTH, small_model
 
 
 def official(clusters=3, dim=5, dtype=torch.float64, prefix=""):
     """A checkpoint in the published layout: full-size VGG16 shapes, zeros except where it matters."""
-    trunk = VGG16Trunk().state_dict()
-    state = {f"encoder.{prefix}{k.removeprefix('features.')}": torch.zeros_like(v) for k, v in trunk.items()}
+    trunk = vgg16_trunk().tensor_shapes()
+    state = {f"encoder.{prefix}{k.removeprefix('features.')}": torch.zeros(shape) for k, shape in trunk.items()}
     state[f"pool.{prefix}centroids"] = torch.randn(clusters, 512)
     state[f"pool.{prefix}conv.weight"] = torch.randn(clusters, 512, 1, 1)
     state["WPCA.0.weight"] = torch.randn(dim, clusters * 512, 1, 1, dtype=dtype)
@@ -36,9 +36,10 @@ def test_official_checkpoints_load_with_k_and_d_from_their_shapes(tmp_path, dtyp
     content = official(clusters=7, dim=9, dtype=dtype, prefix=prefix)
     torch.save(content, tmp_path / "x.pth.tar")
     model = load_checkpoint(tmp_path / "x.pth.tar")
-    assert (model.netvlad.clusters, model.global_dim, model.patch_dim) == (7, 9, 9)
-    assert torch.equal(model.netvlad.centroids, content["state_dict"][f"pool.{prefix}centroids"])
-    assert torch.equal(model.global_projection.weight, content["state_dict"]["WPCA.0.weight"].float().flatten(1))
+    assert (model.clusters, model.global_dim, model.patch_dim) == (7, 9, 9)
+    state = content["state_dict"]
+    assert np.array_equal(model.tensors["netvlad.centroids"], state[f"pool.{prefix}centroids"])
+    assert np.array_equal(model.tensors["global_projection.weight"], state["WPCA.0.weight"].float().flatten(1))
 
 
 def _without(key):

@@ -76,14 +76,18 @@ def _photo_names(shared):
 
 @pytest.fixture(scope="module")
 def described(checkpoint, photos):
-    """(K, width, height) -> describer and the descriptors of the first photographs, made once."""
+    """(K, width, height) -> describer and the descriptors of the first photographs, made once per backend."""
     cache = {}
 
-    def make(clusters, width, height, count):
-        key = (clusters, width, height)
+    def make(clusters, width, height, count, backend="openvino"):
+        key = (clusters, width, height, backend)
         if key not in cache:
             config = Config.make(
-                image_width=width, image_height=height, patch_sizes=SIZES, patch_weights=(0.45, 0.15, 0.4)
+                backend=backend,
+                image_width=width,
+                image_height=height,
+                patch_sizes=SIZES,
+                patch_weights=(0.45, 0.15, 0.4),
             )
             cache[key] = Describer(load_checkpoint(checkpoint(clusters)), config), []
         describer, done = cache[key]
@@ -106,22 +110,23 @@ def test_resizing_equals_the_reference_to_the_bit(shared, photos):
         assert np.array_equal(resized(photos[0], width, height), expected)
 
 
+@pytest.mark.parametrize("backend", ["openvino", "torch"])
 @pytest.mark.parametrize(("width", "height"), [(320, 240), (640, 480)])
-def test_encoder_features_equal_the_reference(golden, described, photos, width, height):
+def test_encoder_features_equal_the_reference(golden, described, photos, width, height, backend):
     from pnv_core.describe.describer import resized
 
     arrays = golden(f"K16_{width}x{height}")
-    describer, _ = described(16, width, height, 0)
-    with torch.inference_mode():
-        full = describer.maps(resized(photos[0], width, height))[0][0].numpy()
+    describer, _ = described(16, width, height, 0, backend)
+    full = describer.maps(resized(photos[0], width, height))[0]
     expected = arrays["feat_full_china"]
     assert np.abs(full - expected).max() <= 1e-4 * np.abs(expected).max()
 
 
+@pytest.mark.parametrize("backend", ["openvino", "torch"])
 @pytest.mark.parametrize(("clusters", "width", "height"), SETS)
-def test_descriptors_equal_the_exact_arrays(golden, described, clusters, width, height):
+def test_descriptors_equal_the_exact_arrays(golden, described, clusters, width, height, backend):
     arrays = golden(f"K{clusters}_{width}x{height}")
-    _, descriptors = described(clusters, width, height, 2)
+    _, descriptors = described(clusters, width, height, 2, backend)
     for image in (0, 1):
         assert np.abs(descriptors[image].global_vector - arrays["vlad_global"][image]).max() < 1e-5
         for size, grid in zip(SIZES, descriptors[image].patches, strict=True):

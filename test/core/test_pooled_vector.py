@@ -7,7 +7,8 @@ import torch
 from pnv_core.describe.describer import Describer
 from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
 from pnv_core.describe.netvlad import NetVLAD, Projection, gem
-from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.describe.torch_model import TorchModel, TorchTrunk
+from pnv_core.describe.trunks.compact import compact_trunk
 from pnv_core.errors import ModelError
 
 WIDTH, HEIGHT = 96, 80
@@ -21,13 +22,13 @@ def counted_mean(maps: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def pooled_model() -> Model:
     torch.manual_seed(4)
-    trunk = CompactTrunk(fires=6, neck=8)
+    trunk = TorchTrunk(compact_trunk(fires=6, neck=8))
     parts = [NetVLAD(3, 8), Projection(24, 6), Projection(24, 5), Projection(trunk.width, 4)]
     for part in parts:
         for parameter in part.parameters():
             torch.nn.init.normal_(parameter)
     info = ModelInfo("compact", {"fires": 6, "neck": 8, "relu": True}, WIDTH, HEIGHT, (2,), (1.0,))
-    return Model(info, trunk.eval().requires_grad_(False), *(p.requires_grad_(False) for p in parts))
+    return TorchModel(info, trunk, *parts).model()
 
 
 def image(seed: int) -> np.ndarray:
@@ -47,13 +48,14 @@ def test_the_global_vector_is_the_projected_vlad_beside_the_projected_mean():
     model = pooled_model()
     describer = Describer(model)
     vector = describer.describe(image(0)).global_vector.astype(np.float64)
+    features, wide = describer.maps(image(0))
     with torch.inference_mode():
-        features, wide = describer.maps(image(0))
-        vlad = model.netvlad(features)[0].double().numpy()
+        vlad = TorchModel.of(model).netvlad(torch.from_numpy(features)[None])[0].double().numpy()
+    mean = counted_mean(wide.astype(np.float64), np.ones(wide[0].size))
     halves = []
-    for part, given in ((model.global_projection, vlad), (model.pooled_projection, None)):
-        given = counted_mean(wide[0].double().numpy(), np.ones(wide[0, 0].numel())) if given is None else given
-        raw = part.weight.double().numpy() @ given + part.bias.double().numpy()
+    for part, given in (("global_projection", vlad), ("pooled_projection", mean)):
+        weight, bias = (model.tensors[f"{part}.{name}"].astype(np.float64) for name in ("weight", "bias"))
+        raw = weight @ given + bias
         halves.append(raw / np.linalg.norm(raw) / np.sqrt(2))
     assert np.allclose(vector, np.concatenate(halves), atol=1e-5)
     assert model.global_dim == len(vector) == 10
@@ -80,6 +82,6 @@ def test_a_model_file_keeps_the_pooled_part(tmp_path):
     assert again.fingerprint() == model.fingerprint()
     assert np.array_equal(Describer(again).describe(image(3)).global_vector,
                           Describer(model).describe(image(3)).global_vector)  # fmt: skip
-    wrong = Model(model.info, model.trunk, model.netvlad, model.global_projection, None, Projection(24, 4))
+    wrong = Model(model.info, model.tensors | {"pooled_projection.weight": np.zeros((4, 24), np.float32)})
     with pytest.raises(ModelError, match="pooled_projection"):
         save_model(wrong, tmp_path / "wrong.safetensors")

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
 TRUNKS: "Registry[Trunk]" = Registry(
     "trunk",
     {
-        "vgg16": "pnv_core.describe.trunks.vgg16:VGG16Trunk",
-        "compact": "pnv_core.describe.trunks.compact:CompactTrunk",
-        "rootsift": "pnv_core.describe.trunks.rootsift:RootSIFTTrunk",
+        "vgg16": "pnv_core.describe.trunks.vgg16:vgg16_trunk",
+        "compact": "pnv_core.describe.trunks.compact:compact_trunk",
+        "rootsift": "pnv_core.describe.trunks.rootsift:rootsift_trunk",
     },
     ModelError,
 )

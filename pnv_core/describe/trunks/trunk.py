@@ -1,42 +1,53 @@
 """What every feature trunk is: an image to a dense feature map. C channels, h x w = H // stride x W // stride cells."""
 
-import torch
-from torch import Tensor, nn
+from collections.abc import Callable
+from dataclasses import dataclass
 
-IMAGENET_MEAN = (0.485, 0.456, 0.406)
-IMAGENET_STD = (0.229, 0.224, 0.225)
+import numpy as np
+from numpy.typing import NDArray
+
+from pnv_core.networks.layers import Crop, Network, Scale, channels_after, shape_after, tensor_shapes
+
+IMAGENET_INPUT = Scale((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))  # mean and standard deviation of ImageNet
+
+Dense = Callable[[NDArray], NDArray[np.float32]]
 
 
-class Trunk(nn.Module):
-    """(B, 3, H, W) RGB in [0, 1] -> (B, C, H // stride, W // stride). Subclasses state their `channels` and `stride`.
+@dataclass(frozen=True)
+class Trunk:
+    """(3, H, W) RGB in [0, 1] -> wide maps (W, h, w), and after the neck features (C, h, w), C = W without one.
 
+    Weights have the names that `layers` and `neck` give them. `dense` stands for a trunk that is no network: an image
+    (H, W, 3), uint8 or float in [0, 1], to its map (`dense_channels`, h, w).
     Cell i is centred at pixel stride * i + stride / 2 - 1.
     """
 
-    channels: int
+    layers: Network
+    neck: Network = ()
+    dense: Dense | None = None
+    dense_channels: int = 0
     stride: int = 16  # pixels per feature cell
-
-    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The feature map, and the one before the trunk's neck (B, W, h, w); the same where there is no neck."""
-        features = self(images)
-        return features, features
 
     @property
     def width(self) -> int:
         """Channels W before the neck."""
-        return self.channels
+        return self.dense_channels or channels_after(self.layers, 3)
 
+    @property
+    def channels(self) -> int:
+        return channels_after(self.neck, self.width)
 
-class ImageNetInput(nn.Module):
-    """Subtracts the ImageNet mean and divides by the standard deviation, per channel."""
+    @property
+    def input_layers(self) -> int:
+        """How many of the first layers only prepare the image."""
+        return next((i for i, layer in enumerate(self.layers) if not isinstance(layer, Crop | Scale)), 0)
 
-    mean: Tensor
-    std: Tensor
+    def tensor_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Its weights by name."""
+        return tensor_shapes(self.layers, 3) | tensor_shapes(self.neck, self.width)
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
-        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
-
-    def forward(self, images: Tensor) -> Tensor:
-        return (images - self.mean) / self.std
+    def shape(self, width: int, height: int) -> tuple[int, int, int]:
+        """(C, h, w) of the features of an image."""
+        if self.dense is not None:
+            return self.channels, height // self.stride, width // self.stride
+        return shape_after(self.neck, shape_after(self.layers, (3, height, width)))

@@ -15,7 +15,6 @@ from pnv_core.config import Config
 from pnv_core.describe.describer import Describer, load_describer
 from pnv_core.describe.download import DEFAULT_MODEL
 from pnv_core.describe.model_files import Model
-from pnv_core.describe.netvlad import Projection
 from pnv_core.errors import ConfigError
 from pnv_core.settings import settings_of
 from pnv_core.types import PatchGrid, PlaceDescriptor
@@ -186,10 +185,8 @@ def test_memory_stays_bounded(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_leading_dimensions_are_the_smaller_projection() -> None:
     full = load_describer(image_width=160, image_height=112, patch_sizes=(2,), patch_precision="float32")
-    model, patches = full.model, full.model.patches_projection
-    small = Projection(patches.weight.shape[1], 16)
-    small.load_state_dict({"weight": patches.weight[:16], "bias": patches.bias[:16]})
-    cut = Describer(Model(model.info, model.trunk, model.netvlad, model.global_projection, small), full.config)
+    small = {name: t[:16] for name, t in full.model.tensors.items() if name.startswith("patch_projection.")}
+    cut = Describer(Model(full.model.info, full.model.tensors | small), full.config)
     expected = cut.describe(place(3)).patches[0].descriptors
     given = leading(full.describe(place(3)).patches[0].descriptors, 16)
     np.testing.assert_allclose(given, expected, atol=2e-5)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from pnv_core.describe.trunks.compact import CompactTrunk
+from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.trunks.compact import compact_trunk
 
 
 @pytest.fixture(scope="session")
@@ -31,5 +32,5 @@ def imagenet_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights with the names of the ImageNet file, values at random."""
     torch.manual_seed(3)
     path = tmp_path_factory.mktemp("weights") / "trunk.pth"
-    torch.save(CompactTrunk(fires=8, neck=0).state_dict(), path)
+    torch.save(TorchTrunk(compact_trunk(fires=8, neck=0)).state_dict(), path)
     return path

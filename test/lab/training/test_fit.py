@@ -5,7 +5,8 @@ import torch.nn.functional as F
 
 from pnv_core.describe.model_files import ModelInfo, load_model, save_model
 from pnv_core.describe.netvlad import Projection, alpha_rule
-from pnv_core.describe.trunks import TRUNKS
+from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.errors import ModelError
 from pnv_lab.fit import FitOptions, adapted_projection, fit_model, image_files, pca, spherical_kmeans
 
@@ -50,10 +51,10 @@ def test_a_rootsift_model_is_fitted_saved_and_loaded(picture_folder, tmp_path):
         patch_sizes=(2, 3),
         patch_weights=(0.5, 0.5),
     )
-    model = fit_model(TRUNKS.make("rootsift"), ModelInfo("rootsift"), image_files([picture_folder]), options)
-    save_model(model, tmp_path / "m.safetensors")
+    model = fit_model(TorchTrunk(rootsift_trunk()), ModelInfo("rootsift"), image_files([picture_folder]), options)
+    save_model(model.model(), tmp_path / "m.safetensors")
     again = load_model(tmp_path / "m.safetensors")
-    assert (again.netvlad.clusters, again.global_dim, again.patch_dim) == (4, 3, 6)
+    assert (again.clusters, again.global_dim, again.patch_dim) == (4, 3, 6)
     assert again.info.patch_sizes == (2, 3)
 
 

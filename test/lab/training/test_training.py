@@ -6,8 +6,10 @@ import torch
 
 from pnv_core.describe.model_files import ModelInfo
 from pnv_core.describe.netvlad import NetVLAD
+from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
+from pnv_core.networks.layers import Conv
 from pnv_lab.fit import FitOptions
 from pnv_lab.training.augment import Camera, flat_view, panorama_view, relight
 from pnv_lab.training.batches import BatchOptions, PlaceBatches
@@ -173,16 +175,9 @@ def test_synthetic_validation_has_one_true_reference_per_query(picture_folder):
     assert (known.true & known.counted).any(1).all()
 
 
-class TinyTrunk(Trunk):
-    channels = 6
-
-    def __init__(self):
-        super().__init__()
-        torch.manual_seed(0)
-        self.features = torch.nn.Sequential(torch.nn.Conv2d(3, 6, 16, stride=16))
-
-    def forward(self, images):
-        return self.features(images)
+def tiny_trunk():
+    torch.manual_seed(0)
+    return TorchTrunk(Trunk((Conv("features.0", 6, 16, 16),)))
 
 
 def test_triplet_training_resumes_at_the_last_cache(picture_folder, tmp_path):
@@ -192,7 +187,7 @@ def test_triplet_training_resumes_at_the_last_cache(picture_folder, tmp_path):
         torch.nn.init.normal_(netvlad.centroids)
         torch.nn.init.normal_(netvlad.assignment)
         options = TripletOptions(epochs=2, width=96, height=80, cache_queries=4, rate=0.01, first_layer=0, mixed=False)
-        return TripletTrainer(TinyTrunk(), netvlad, load_set(picture_folder), [], options, folder)
+        return TripletTrainer(tiny_trunk(), netvlad, load_set(picture_folder), [], options, folder)
 
     whole = make(tmp_path / "whole")
     whole.run()

@@ -2,11 +2,20 @@ import numpy as np
 import pytest
 import torch
 
-from pnv_core.describe.trunks.compact import CompactTrunk
-from pnv_core.describe.trunks.rootsift import RootSIFTTrunk
+from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.rootsift import rootsift_trunk
 
 
-@pytest.mark.parametrize("trunk", [CompactTrunk(), CompactTrunk(fires=5, neck=0, relu=False), RootSIFTTrunk()])
+def compact(**options):
+    return TorchTrunk(compact_trunk(**options))
+
+
+def rootsift():
+    return TorchTrunk(rootsift_trunk())
+
+
+@pytest.mark.parametrize("trunk", [compact(), compact(fires=5, neck=0, relu=False), rootsift()])
 @pytest.mark.parametrize("size", [(480, 640), (240, 320), (100, 131)])
 def test_a_map_has_one_cell_per_sixteen_pixels(trunk, size):
     with torch.inference_mode():
@@ -19,7 +28,7 @@ def test_a_cell_of_the_compact_trunk_looks_at_pixels_around_its_centre(fires):
     """VGG16's cell i is centred at pixel 16 i + 7: keypoints of both trunks mean the same."""
     torch.manual_seed(0)
     images = torch.rand(1, 3, 320, 320, dtype=torch.float64, requires_grad=True)
-    CompactTrunk(fires=fires, neck=0).double()(images)[0, :, 10, 9].sum().backward()
+    compact(fires=fires, neck=0).double()(images)[0, :, 10, 9].sum().backward()
     touched = images.grad.abs().sum((0, 1))
     rows, cols = torch.nonzero(touched.sum(1)).flatten(), torch.nonzero(touched.sum(0)).flatten()
     assert (rows.min() + rows.max()) / 2 == 16 * 10 + 7
@@ -27,12 +36,12 @@ def test_a_cell_of_the_compact_trunk_looks_at_pixels_around_its_centre(fires):
 
 
 def test_front_and_back_make_the_whole_trunk():
-    trunk = CompactTrunk().eval()
+    trunk = compact().eval()
     images = torch.rand(2, 3, 96, 112)
     with torch.inference_mode():
         features, wide = trunk.back(trunk.front(images, 9), 9)
         assert torch.equal(features, trunk(images))
-        assert torch.equal(trunk.neck(wide), features)
+        assert torch.equal(trunk.run(wide, len(trunk.trunk.layers)), features)
         assert wide.shape[1] == trunk.width
 
 
@@ -40,14 +49,14 @@ def test_rootsift_ignores_brightness_and_contrast():
     torch.manual_seed(1)
     image = torch.rand(1, 3, 64, 64)
     with torch.inference_mode():
-        plain, dimmed = RootSIFTTrunk()(image), RootSIFTTrunk()(0.2 + 0.5 * image)
+        plain, dimmed = rootsift()(image), rootsift()(0.2 + 0.5 * image)
     assert torch.allclose(plain, dimmed, atol=1e-4)
     assert torch.allclose(plain.norm(dim=1), torch.ones(1, 4, 4), atol=1e-3)
 
 
 def test_rootsift_of_a_blank_image_is_zero():
     with torch.inference_mode():
-        assert RootSIFTTrunk()(torch.full((1, 3, 64, 64), 0.4)).abs().max() < 1e-2
+        assert rootsift()(torch.full((1, 3, 64, 64), 0.4)).abs().max() < 1e-2
 
 
 def test_rootsift_equals_a_histogram_counted_pixel_by_pixel():
@@ -76,5 +85,5 @@ def test_rootsift_equals_a_histogram_counted_pixel_by_pixel():
     expected = np.sqrt(sift / sift.sum())
     with torch.inference_mode():
         images = torch.from_numpy(image).float()[None, None].expand(1, 3, -1, -1)
-        found = RootSIFTTrunk()(images)[0, :, 2, 2].double().numpy()
+        found = rootsift()(images)[0, :, 2, 2].double().numpy()
     assert np.abs(found - expected).max() < 1e-4

@@ -1,0 +1,179 @@
+"""Describing with OpenVINO: the trunk is one graph, what follows it another that always computes in float32.
+
+K clusters, C channels, W channels before the trunk's neck, h x w feature map (N = h * w cells), D dimensions,
+n = patches of one size. Window sums add one axis at a time and cancel nothing. A projection is linear and so is the sum
+over a window: each cluster's residual map is projected once, and its windows are summed afterwards; only the norms of
+the intra-normalisation need the unprojected sums.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import openvino as ov
+from numpy.typing import NDArray
+from openvino import opset15 as ops
+
+from pnv_core.describe.model_files import Model
+from pnv_core.networks.openvino_backend import Compiled, Node, build, constant, image_input, integers
+
+Floats = NDArray[np.float32]
+Windows = Sequence[tuple[int, int]]  # (size, stride) per patch size
+
+_COLUMNS = 16  # of the projection at a time: with K clusters their maps then fit the second-level cache
+_SEPARATE = 4  # sizes from here on are summed one axis at a time
+_EPSILON = 1e-12  # as F.normalize
+
+
+class OpenVinoDescribing:
+    """A model at one image size, on the processor. `pixels` are (H, W, 3) uint8 of that size."""
+
+    def __init__(
+        self, model: Model, size: tuple[int, int], windows: Windows, threads: int, precision: str, cache: Path | None
+    ) -> None:
+        """`precision` is that of the trunk; `cache` a folder for what is compiled."""
+        trunk, (width, height) = model.trunk, size
+        self.cells = trunk.shape(width, height)[1:]
+        self._cells = np.ones((1, 1, *self.cells), np.float32)
+        self._dense = trunk.dense
+
+        def kept(*shaping: object) -> Path | None:
+            if cache is None:
+                return None
+            return cache / hashlib.sha256(f"{model.fingerprint()} {shaping}".encode()).hexdigest()[:32]
+
+        self._trunk: Compiled | None = None
+        if trunk.dense is None:
+            self._trunk = Compiled(partial(_trunk, model, size), threads, precision, kept("trunk", size))
+        self._head = Compiled(
+            partial(head, model, self.cells, windows), threads, kept=kept("head", self.cells, [*map(tuple, windows)])
+        )
+
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, Floats]:
+        """The trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+        if self._trunk is None:
+            assert self._dense is not None
+            features = self._dense(pixels)
+            return features, features
+        found = self._trunk(np.ascontiguousarray(pixels)[None])
+        return found[0][0], found[-1][0]
+
+    def describe(self, pixels: NDArray[np.uint8], cells: Floats | None = None) -> tuple[Floats, list[Floats]]:
+        """The global vector (D,) and the patches [(n, D), ...]. `cells` (h, w) say how much each cell counts."""
+        features, wide = self.maps(pixels)
+        counted = self._cells if cells is None else np.ascontiguousarray(cells, np.float32).reshape(self._cells.shape)
+        vector, *patches = self._head(features[None], wide[None], counted)
+        return vector, patches
+
+
+def _trunk(model: Model, size: tuple[int, int]) -> ov.Model:
+    """(1, H, W, 3) uint8 -> the trunk's maps, and those before its neck where it has one."""
+    trunk, weights = model.trunk, model.part("trunk")
+    pixels, images = image_input(*size)
+    wide = build(trunk.layers, weights, images)
+    return ov.Model([build(trunk.neck, weights, wide), wide] if trunk.neck else [wide], [pixels], "trunk")
+
+
+def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
+    """(1, C, h, w), (1, W, h, w) and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
+    h, w = cells
+    centroids = model.tensors["netvlad.centroids"]
+    c = centroids.shape[1]
+    features = ops.parameter([1, c, h, w], np.float32)
+    wide = ops.parameter([1, model.trunk.width, h, w], np.float32)
+    counted = ops.parameter([1, 1, h, w], np.float32)
+    x = ops.reshape(_unit(features, 1), integers(c, h * w), False)
+    logits = ops.matmul(constant(model.tensors["netvlad.assignment"]), x, False, False)  # (K, N)
+    weights = ops.multiply(ops.softmax(logits, 0), ops.reshape(counted, integers(1, h * w), False))
+    vector = _global_vector(model, x, weights, wide, counted)
+    scales = _scales(centroids, x, weights, cells, windows)
+    patches = _patches(model, x, weights, scales, cells, windows)
+    return ov.Model([vector, *patches], [features, wide, counted], "head")
+
+
+def _unit(x: Node, axis: int) -> Node:
+    return ops.normalize_l2(x, integers(axis), _EPSILON**2, "max")
+
+
+def _projected(model: Model, part: str, row: Node) -> Node:
+    """(1, inputs) -> unit (1, D)."""
+    weight, bias = (model.tensors[f"{part}.{name}"] for name in ("weight", "bias"))
+    return _unit(ops.add(ops.matmul(row, constant(weight), False, True), constant(bias[None])), 1)
+
+
+def _global_vector(model: Model, x: Node, weights: Node, wide: Node, counted: Node) -> Node:
+    """Projected VLAD, and beside it the projected generalised mean where the model has one: (D,)."""
+    centroids = model.tensors["netvlad.centroids"]
+    mass = ops.reduce_sum(weights, integers(1), True)  # (K, 1)
+    sums = ops.subtract(ops.matmul(weights, x, False, True), ops.multiply(mass, constant(centroids)))
+    vlad = _unit(ops.reshape(_unit(sums, 1), integers(1, centroids.size), False), 1)
+    vector = _projected(model, "global_projection", vlad)
+    if model.has("pooled_projection"):
+        cubes = ops.power(ops.maximum(wide, constant(1e-6)), constant(3.0))
+        total = ops.reduce_sum(ops.multiply(cubes, counted), integers(2, 3), False)  # (1, W)
+        area = ops.maximum(ops.reduce_sum(counted, integers(2, 3), False), constant(1e-6))
+        mean = ops.maximum(ops.divide(total, area), constant(1e-18))
+        pooled = _unit(ops.power(mean, constant(1 / 3)), 1)
+        both = ops.concat([vector, _projected(model, "pooled_projection", pooled)], 1)
+        vector = ops.multiply(both, constant(np.sqrt(0.5)))
+    return ops.reshape(vector, integers(-1), False)
+
+
+def _window_means(maps: Node, size: int, stride: int) -> Node:
+    """(K, C, h, w) -> (K, C, rows, cols)."""
+    pool = partial(ops.avg_pool, pads_begin=[0, 0], pads_end=[0, 0], exclude_pad=True)
+    if size < _SEPARATE:
+        return pool(maps, [stride, stride], kernel_shape=[size, size])
+    return pool(pool(maps, [stride, 1], kernel_shape=[size, 1]), [1, stride], kernel_shape=[1, size])
+
+
+def _scales(centroids: Floats, x: Node, weights: Node, cells: tuple[int, int], windows: Windows) -> list[Node]:
+    """Per patch size the factor (K, 1, rows, cols) that makes each cluster's mean residual unit, and all of them."""
+    h, w = cells
+    local = ops.reshape(x, integers(1, -1, h, w), False)
+    squares: list[list[Node]] = [[] for _ in windows]
+    for number, centroid in enumerate(centroids):  # one cluster at a time: its maps stay in cache
+        rows = ops.slice(weights, integers(number), integers(number + 1), integers(1), integers(0))
+        weight = ops.reshape(rows, integers(1, 1, h, w), False)
+        residuals = ops.multiply(ops.subtract(local, constant(centroid[None, :, None, None])), weight)
+        for found, window in zip(squares, windows, strict=True):
+            means = _window_means(residuals, *window)
+            found.append(ops.reduce_sum(ops.multiply(means, means), integers(1), True))
+    scales = []
+    for found in squares:
+        norms = ops.sqrt(ops.concat(found, 0))
+        floor = ops.maximum(norms, constant(_EPSILON))
+        units = ops.divide(norms, floor)
+        total = ops.sqrt(ops.reduce_sum(ops.multiply(units, units), integers(0), True))
+        touched = ops.convert(ops.greater(total, constant(0.0)), "f32")  # a patch no cluster touches becomes zero
+        scales.append(ops.divide(touched, ops.multiply(floor, ops.maximum(total, constant(_EPSILON)))))
+    return scales
+
+
+def _patches(
+    model: Model, x: Node, weights: Node, scales: list[Node], cells: tuple[int, int], windows: Windows
+) -> list[Node]:
+    """Projected unit patches per size, (n, D)."""
+    h, w = cells
+    centroids = model.tensors["netvlad.centroids"]
+    k, c = centroids.shape
+    weight, bias = (model.tensors[f"{model.patches_projection}.{name}"] for name in ("weight", "bias"))
+    parts: list[list[Node]] = [[] for _ in windows]
+    assigned = ops.reshape(weights, integers(k, 1, h, w), False)
+    for start in range(0, len(bias), _COLUMNS):
+        block = weight[start : start + _COLUMNS].reshape(-1, k, c).transpose(1, 0, 2)  # (K, d, C)
+        offsets = np.einsum("kdc,kc->kd", block, centroids)[:, :, None, None]
+        projected = ops.matmul(constant(block.reshape(-1, c)), x, False, False)
+        maps = ops.reshape(projected, integers(k, -1, h, w), False)
+        residuals = ops.multiply(ops.subtract(maps, constant(offsets)), assigned)
+        for found, scale, window in zip(parts, scales, windows, strict=True):
+            scaled = ops.multiply(_window_means(residuals, *window), scale)
+            found.append(ops.reduce_sum(scaled, integers(0), True))  # (1, d, rows, cols)
+    rows = []
+    for found, scale in zip(parts, scales, strict=True):
+        touched = ops.convert(ops.greater(ops.reduce_max(scale, integers(0), True), constant(0.0)), "f32")
+        vectors = ops.multiply(_unit(ops.add(ops.concat(found, 1), constant(bias[None, :, None, None])), 1), touched)
+        rows.append(ops.transpose(ops.reshape(vectors, integers(len(bias), -1), False), integers(1, 0)))
+    return rows

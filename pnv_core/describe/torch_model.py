@@ -1,0 +1,186 @@
+"""A Model in torch: for training, for CUDA, and as the oracle of the numbers. B images, K clusters, C channels."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from pnv_core.describe.model_files import OPTIONAL, Model, ModelInfo, build_model
+from pnv_core.describe.netvlad import NetVLAD, Projection, gem
+from pnv_core.describe.patches import patch_descriptors
+from pnv_core.describe.trunks.trunk import Trunk
+from pnv_core.errors import ConfigError
+from pnv_core.networks.torch_backend import TorchNetwork
+
+
+class TorchTrunk(TorchNetwork):
+    """A trunk; its parameters have the names of the model file. (B, 3, H, W) RGB in [0, 1] in."""
+
+    def __init__(self, trunk: Trunk) -> None:
+        super().__init__((*trunk.layers, *trunk.neck))
+        self.trunk = trunk
+        self.channels, self.width, self.stride = trunk.channels, trunk.width, trunk.stride
+
+    @property
+    def depth(self) -> int:
+        """Layers before the neck, after those that prepare the image."""
+        return len(self.trunk.layers) - self.trunk.input_layers
+
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """The feature map (B, C, h, w), and the one before the neck (B, W, h, w)."""
+        if self.trunk.dense is not None:
+            features = [self.trunk.dense(image) for image in images.permute(0, 2, 3, 1).cpu().numpy()]
+            found = torch.from_numpy(np.stack(features)).to(images.device)
+            return found, found
+        return self.back(self.front(images, 0), 0)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.maps(images)[0]
+
+    def front(self, images: Tensor, layers: int) -> Tensor:
+        """(B, 3, H, W) -> what the first `layers`, after those that prepare the image, give."""
+        return self.run(images, 0, self.trunk.input_layers + layers)
+
+    def back(self, maps: Tensor, layers: int) -> tuple[Tensor, Tensor]:
+        """The rest after `front` with as many layers: features, and what is before the neck."""
+        wide = self.wide(maps, layers)
+        return self.run(wide, len(self.trunk.layers)), wide
+
+    def wide(self, maps: Tensor, layers: int) -> Tensor:
+        """As `back`, without the neck."""
+        return self.run(maps, self.trunk.input_layers + layers, len(self.trunk.layers))
+
+    def front_parameters(self, layers: int) -> list[nn.Parameter]:
+        """Those that `front` uses."""
+        return self.parameters_of(0, self.trunk.input_layers + layers)
+
+
+@dataclass(frozen=True, eq=False)
+class TorchModel:
+    """As Model, in modules."""
+
+    info: ModelInfo
+    trunk: TorchTrunk
+    netvlad: NetVLAD
+    global_projection: Projection
+    patch_projection: Projection | None = None
+    pooled_projection: Projection | None = None
+
+    @classmethod
+    def of(cls, model: Model) -> "TorchModel":
+        """The same model, for inference."""
+        modules: dict[str, nn.Module] = {"trunk": TorchTrunk(model.trunk)}
+        modules["netvlad"] = NetVLAD(*model.tensors["netvlad.centroids"].shape)
+        for part in ("global_projection", *OPTIONAL):
+            if model.has(part):
+                outputs, inputs = model.tensors[f"{part}.weight"].shape
+                modules[part] = Projection(inputs, outputs)
+        for part, module in modules.items():
+            module.load_state_dict({name: torch.from_numpy(t) for name, t in model.part(part).items()})
+            module.eval().requires_grad_(False)
+        return cls(model.info, **modules)  # type: ignore[arg-type]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every learned tensor by its name in the file."""
+        return {f"{part}.{k}": v.detach() for part, m in self.parts().items() for k, v in m.state_dict().items()}
+
+    def model(self) -> Model:
+        """As it is saved and described with."""
+        arrays = {name: tensor.float().cpu().numpy() for name, tensor in self.tensors().items()}
+        return build_model(self.info, arrays, "this model")
+
+    def parts(self) -> dict[str, nn.Module]:
+        """The modules by the names of the model file."""
+        names = ("trunk", "netvlad", "global_projection", *OPTIONAL)
+        return {name: module for name in names if (module := getattr(self, name)) is not None}
+
+    @property
+    def patches_projection(self) -> Projection:
+        return self.patch_projection or self.global_projection
+
+    def global_vector(self, vlad: Tensor, wide: Tensor, cells: Tensor | None = None) -> Tensor:
+        """VLADs (B, K * C) and the maps before the trunk's neck (B, W, h, w) -> unit global vectors (B, D).
+
+        `cells` (B, N) say how much each cell counts.
+        """
+        vector: Tensor = self.global_projection(vlad)
+        if self.pooled_projection is None:
+            return vector
+        return torch.cat([vector, self.pooled_projection(gem(wide, cells))], dim=1) * math.sqrt(0.5)
+
+
+class TorchDescribing:
+    """A model at one image size, on `device`: the plain formulation. `pixels` are (H, W, 3) uint8 of that size.
+
+    `windows` are (size, stride) per patch size; `precision` is that of the trunk.
+    """
+
+    def __init__(
+        self, model: Model, windows: Sequence[tuple[int, int]], threads: int, precision: str, device: torch.device
+    ) -> None:
+        self._model = TorchModel.of(model)
+        self._windows, self._half, self._device = windows, precision == "bfloat16", device
+        for module in self._model.parts().values():
+            module.to(device)
+        self._model.trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._threads = threads
+
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+        with torch.inference_mode(), _threads(self._threads):
+            features, wide = self._maps(pixels)
+            return features[0].cpu().numpy(), wide[0].cpu().numpy()
+
+    def _maps(self, pixels: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+        images = torch.from_numpy(pixels.copy()).to(self._device).permute(2, 0, 1)[None].float() / 255.0
+        with torch.autocast(self._device.type, torch.bfloat16, enabled=self._half):
+            features, wide = self._model.trunk.maps(images.contiguous(memory_format=torch.channels_last))
+        return features.float(), wide.float()
+
+    def describe(
+        self, pixels: NDArray[np.uint8], cells: NDArray[np.float32] | None = None
+    ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
+        """The global vector (D,) and the patches [(n, D), ...]. `cells` (h, w) say how much each cell counts."""
+        with torch.inference_mode(), _threads(self._threads):
+            features, wide = self._maps(pixels)
+            x, weights = self._model.netvlad.soft_assign(features)
+            counted = None
+            if cells is not None:
+                counted = torch.from_numpy(cells).to(weights).reshape(1, -1)
+                weights = weights * counted[:, None]
+            vector = self._model.global_vector(self._model.netvlad.vlad(x, weights), wide, counted)[0]
+            projection, centroids = self._model.patches_projection, self._model.netvlad.centroids
+            patches = patch_descriptors(
+                x[0], weights[0], centroids, projection.weight, projection.bias,
+                (features.shape[-2], features.shape[-1]),
+                [size for size, _ in self._windows], [stride for _, stride in self._windows],
+            )  # fmt: skip
+            return vector.cpu().numpy(), [rows.cpu().numpy() for rows in patches]
+
+
+def torch_device(name: str) -> torch.device:
+    """'auto' is CUDA where there is one. Raises ConfigError for CUDA where there is none."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device = 'cuda' but torch sees no CUDA device; allowed here: cpu, auto")
+    return torch.device(name)
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """torch's number of threads, for as long as this describes: the program around it has its own."""
+    before = torch.get_num_threads()
+    if not count or count == before:
+        yield
+        return
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

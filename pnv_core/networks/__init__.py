@@ -1,0 +1,1 @@
+"""Convolutional networks as data, and what runs them. A layer below describe/ and verify/, which say which networks."""

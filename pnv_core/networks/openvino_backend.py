@@ -1,0 +1,169 @@
+"""Networks in OpenVINO: graphs built from layers and numpy weights, compiled for this processor, kept on disk.
+
+C channels, H x W pixels; one image at a time.
+"""
+
+import functools
+import hashlib
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import openvino as ov
+from numpy.typing import NDArray
+from openvino import opset15 as ops
+
+from pnv_core.files import atomic_write
+from pnv_core.networks.layers import (
+    Add,
+    AvgPool,
+    Block,
+    Concat,
+    Conv,
+    Crop,
+    InstanceNorm,
+    Layer,
+    MaxPool,
+    Network,
+    Relu,
+    Resize,
+    Scale,
+    Sigmoid,
+    SpaceToDepth,
+    shape_after,
+)
+
+Node = Any  # what an operation gives
+Weights = Mapping[str, NDArray[np.float32]]
+_DIGEST = hashlib.sha256().digest_size
+PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
+
+
+class Compiled:
+    """A graph ready to run on this processor."""
+
+    def __init__(
+        self, graph: Callable[[], ov.Model], threads: int, precision: str = "float32", kept: Path | None = None
+    ) -> None:
+        """`graph` makes it; `threads` 0 = all cores. `kept` is a file for what was compiled: its name must tell apart
+        whatever shapes the graph. With other settings, another release of the library or damage it is made again."""
+        settings: dict[str, Any] = {
+            "PERFORMANCE_HINT": "LATENCY",
+            "INFERENCE_PRECISION_HINT": PRECISIONS[precision],
+            "INFERENCE_NUM_THREADS": threads,
+            "ENABLE_CPU_PINNING": False,  # the camera's driver and the middleware want these cores as well
+        }
+        stamp = f"{ov.__version__} {settings}".encode()
+        found = _kept(kept, stamp, settings) if kept is not None else None
+        if found is None:
+            found = ov.Core().compile_model(graph(), "CPU", settings)
+            if kept is not None:
+                _keep(kept, stamp, found.export_model().getvalue())
+        self._request = found.create_infer_request()
+
+    def __call__(self, *inputs: NDArray) -> list[NDArray[np.float32]]:
+        """The outputs for contiguous inputs; arrays of the caller's own."""
+        self._request.infer(list(inputs), share_inputs=True)
+        return [tensor.data.copy() for tensor in self._request.output_tensors]
+
+
+def _kept(path: Path, stamp: bytes, settings: dict[str, Any]) -> ov.CompiledModel | None:
+    """What `_keep` wrote with the same stamp; None for anything else."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, body = content[:_DIGEST], content[_DIGEST:]
+    if hashlib.sha256(stamp + body).digest() != digest:
+        return None
+    try:
+        return ov.Core().import_model(io.BytesIO(body), "CPU", settings)
+    except RuntimeError:  # from a processor that differs, say
+        return None
+
+
+def _keep(path: Path, stamp: bytes, body: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as file:
+            file.write(hashlib.sha256(stamp + body).digest() + body)
+    except OSError:
+        pass  # a home that cannot be written to costs time at the next start, nothing else
+
+
+def fast_precisions() -> list[str]:
+    """What this processor multiplies natively, by the library's account: FP32, BF16, INT8, ..."""
+    return list(ov.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
+
+
+def image_input(width: int, height: int) -> tuple[Node, Node]:
+    """(1, H, W, 3) uint8 parameter, and the same as (1, 3, H, W) float32 in [0, 1]."""
+    pixels = ops.parameter([1, height, width, 3], np.uint8)
+    scaled = ops.multiply(ops.convert(pixels, "f32"), constant(1 / 255))
+    return pixels, ops.transpose(scaled, integers(0, 3, 1, 2))
+
+
+def build(network: Network, weights: Weights, x: Node) -> Node:
+    """The network's output for x (1, C, H, W)."""
+    for layer in network:
+        x = _step(layer, weights, x)
+    return x
+
+
+def _step(layer: Layer, weights: Weights, x: Node) -> Node:
+    match layer:
+        case Crop():
+            _, height, width = shape_after((layer,), tuple(x.output(0).shape)[1:])
+            return ops.slice(x, integers(0, 0), integers(height, width), integers(1, 1), integers(2, 3))
+        case Scale(mean=mean, std=std):
+            return ops.divide(ops.subtract(x, _per_channel(mean)), _per_channel(std))
+        case Conv():
+            return _convolution(layer, weights, x)
+        case Relu(most=most):
+            return ops.relu(x) if most is None else ops.clamp(x, 0.0, most)
+        case MaxPool(kernel=k, stride=s, pads=(top, left, bottom, right), ceil=ceil):
+            rounding = "ceil_torch" if ceil else "floor"
+            return ops.max_pool(x, [s, s], [1, 1], [top, left], [bottom, right], [k, k], rounding).output(0)
+        case AvgPool(kernel=k, stride=s):
+            return ops.avg_pool(x, [s, s], [0, 0], [0, 0], [k, k], True)
+        case InstanceNorm(epsilon=epsilon):
+            return ops.mvn(x, integers(2, 3), True, epsilon, "inside_sqrt")
+        case Resize(factor=factor):
+            scales = constant([factor, factor])
+            return ops.interpolate(x, scales, "linear_onnx", "scales", axes=integers(2, 3))  # half pixels, as torch
+        case SpaceToDepth(block=block):
+            return ops.space_to_depth(x, "depth_first", block)
+        case Sigmoid():
+            return ops.sigmoid(x)
+        case Block(layers=layers):
+            return build(layers, weights, x)
+        case Add(branches=branches):
+            return functools.reduce(ops.add, [build(branch, weights, x) for branch in branches])
+        case Concat(branches=branches):
+            return ops.concat([build(branch, weights, x) for branch in branches], 1)
+
+
+def _convolution(conv: Conv, weights: Weights, x: Node) -> Node:
+    kernel = weights[f"{conv.name}.weight"]
+    (top, left, bottom, right), strides = conv.pads, [conv.stride] * 2
+    if conv.groups > 1:
+        kernel = kernel.reshape(conv.groups, -1, *kernel.shape[1:])
+    convolve = ops.group_convolution if conv.groups > 1 else ops.convolution
+    y = convolve(x, constant(kernel), strides, [top, left], [bottom, right], [1, 1])
+    return ops.add(y, _per_channel(weights[f"{conv.name}.bias"])) if conv.bias else y
+
+
+def _per_channel(values: Sequence[float] | NDArray[np.float32]) -> Node:
+    return constant(np.asarray(values, np.float32).reshape(1, -1, 1, 1))
+
+
+def constant(values: Any) -> Node:
+    """A float32 constant of the shape of the values."""
+    return ops.constant(np.ascontiguousarray(values, np.float32))
+
+
+def integers(*values: int) -> Node:
+    """A list of int64, as shapes and axes are given."""
+    return ops.constant(np.array(values, np.int64))
