@@ -131,7 +131,7 @@ def test_figures_follow_the_settings_whatever_was_cached_before(root: Path, tmp_
 
 
 _OTHER = {
-    "preset": "speed", "device": "auto", "trunk_precision": "bfloat16", "patch_mode": "fast", "patch_sizes": (2, 4),
+    "preset": "speed", "device": "auto", "trunk_precision": "bfloat16", "backend": "torch", "patch_sizes": (2, 4),
     "patch_strides": (1, 2), "patch_weights": (0.3, 0.7), "patch_precision": "float16", "scorer": "rapid",
     "eviction": "densest", "patch_store": "disk", "index": "exact", "patch_folder": "/", "verifier": "rootsift2",
 }  # fmt: skip
@@ -151,7 +151,7 @@ def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_p
         if second != first:
             told.append(name)
             assert Describing(second, tmp_path).store.folder != folder, name
-    assert {"trunk_precision", "patch_mode", "patch_sizes", "image_width", "patch_precision"} <= set(told)
+    assert {"trunk_precision", "backend", "patch_sizes", "image_width", "patch_precision"} <= set(told)
     assert not {"scale_weight", "accept_score", "memory_budget_mb", "candidates"} & set(told)  # described once for all
 
 
