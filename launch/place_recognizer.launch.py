@@ -5,7 +5,7 @@ ros2 launch pnv_ros place_recognizer.launch.py image_topics:="['/camera/image_ra
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -19,7 +19,8 @@ ARGUMENTS = {
 
 
 def generate_launch_description():
-    config = PathJoinSubstitution([FindPackageShare("pnv_ros"), "config", [LaunchConfiguration("preset"), ".yaml"]])
+    # one flat list: launch before 3.4.5 takes no list inside another
+    config = [FindPackageShare("pnv_ros"), "/config/", LaunchConfiguration("preset"), ".yaml"]
     return LaunchDescription(
         [
             DeclareLaunchArgument("namespace", default_value="", description="namespace of the node"),

@@ -286,7 +286,8 @@ def _export(
             texts[targets.tum] = poses_to_tum({ref.stamp_ns: pose for ref, pose in nodes.items()})
         if targets.g2o:
             for ref, pose in sorted(nodes.items(), key=lambda node: node[0].stamp_ns):
-                recognizer.odometry.add(ref.stamp_ns, *map(float, pose.position))  # the run decided without it
+                x, y, z = map(float, pose.position)
+                recognizer.odometry.add(ref.stamp_ns, x, y, z)  # the run decided without it
             measured = RelativePoses(recognizer, cameras)
             closures = [(c, measured.of(c)) for c in accepted]
             texts[targets.g2o] = graph_to_g2o({ref.id: pose for ref, pose in nodes.items()}, closures)

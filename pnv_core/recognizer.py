@@ -66,7 +66,11 @@ class PlaceRecognizer:
             )
         limit = self.budget.affordable(len(candidates), self.config.time_budget_ms / 1e3)
         with self.timer.stage("rerank"), self.budget.taken(limit):
-            known = [self.database.descriptor(ref.id) for ref, _ in candidates[:limit]]
+            tried = candidates[:limit]
+            stored = self.database.readable(ref.id for ref, _ in tried)
+            gone = {ref.id for ref, _ in tried} - set(stored)
+            candidates = [(ref, similarity) for ref, similarity in candidates if ref.id not in gone]
+            known = list(stored.values())
             query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
             closures = self.judge.judged(query, descriptor, predecessor, candidates, known, self.config)
         with self.timer.stage("store"):

@@ -137,6 +137,9 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
 
 
+NO_PICTURE = -2  # local_inliers of a keyframe of which no picture was kept (`verify: 0`)
+
+
 @dataclass(frozen=True)
 class Evidence:
     """What is known of a candidate before the decision.
@@ -154,7 +157,7 @@ class Evidence:
     recent_lead: float = 0.0  # of similarity over that of the query's predecessor to the query
     spatial_lead: float = 0.0  # of the spatial score over the best candidate elsewhere
     texture: float = 1.0  # the lesser of both images, in [0, 1]
-    local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined
+    local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined, -2: no picture to examine
     local_spread: float = 0.0  # of those
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
 

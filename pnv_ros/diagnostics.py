@@ -7,10 +7,11 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
+from pnv_ros.companions import Companions
 from pnv_ros.inputs import ImageInputs
 from pnv_ros.parameters import Settings
 from pnv_ros.recognition import Recognition
-from pnv_ros.statistics import Drop, Statistics
+from pnv_ros.statistics import Counts, Drop, Statistics
 
 _WINDOW_S = 5.0  # rates are over this long
 _REPEAT_S = 30.0  # the log repeats that no image comes
@@ -22,7 +23,7 @@ class Diagnostics:
     def __init__(self, node: Node, recognition: Recognition, statistics: Statistics) -> None:
         self._node, self._recognition, self._statistics = node, recognition, statistics
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
-        self._looks: deque[tuple[float, int, int, int, int]] = deque()
+        self._looks: deque[tuple[float, Counts, int]] = deque()  # when, counts, odometry samples refused
         self._seen: dict[str, tuple[int, float]] = {}
         self._warned: dict[str, float] = {}
 
@@ -35,17 +36,16 @@ class Diagnostics:
         self._seen.clear()
         self._warned.clear()
 
-    def look(self, settings: Settings, inputs: ImageInputs) -> None:
+    def look(self, settings: Settings, inputs: ImageInputs, companions: Companions) -> None:
         """Publish the status of this second."""
         now = time.monotonic()
-        received, processed, dropped = self._statistics.totals()
-        unusable, behind = dropped.get(Drop.UNUSABLE, 0), dropped.get(Drop.STAMP_BACK, 0)
-        self._looks.append((now, received, processed, unusable, behind))
+        self._looks.append((now, self._statistics.counts(), self._recognition.recognizer.odometry.refused))
         while now - self._looks[0][0] > _WINDOW_S and len(self._looks) > 2:
             self._looks.popleft()
-        then, received_then, processed_then, unusable_then, behind_then = self._looks[0]
+        then, earlier, refused_then = self._looks[0]
         span = max(now - then, 1e-9)
-        rates = (received - received_then) / span, (processed - processed_then) / span
+        late = self._looks[-1][1].since(earlier)
+        rates = late.received.total() / span, late.processed.total() / span
         silent = self._silent(now, settings.node.no_image_warning_s, settings.node.image_topics)
         if inputs.paused:
             self._warned.clear()  # it says nothing about whether images come
@@ -53,23 +53,41 @@ class Diagnostics:
             self._log_silence(now, silent, inputs)
 
         fleet = self._recognition.fleet.status() if self._recognition.fleet is not None else None
+        level = DiagnosticStatus.WARN
         if self._statistics.autosave_failure:
             level, text = DiagnosticStatus.ERROR, f"autosave: {self._statistics.autosave_failure}"
         elif inputs.paused:
-            level, text = DiagnosticStatus.OK, "paused"
+            text = "paused"
         elif silent:
             topic, seconds = next(iter(silent.items()))
-            level, text = DiagnosticStatus.WARN, f"no image for {seconds:.0f} s on {topic}: {inputs.hint(topic)}"
-        elif unusable > unusable_then:
-            level, text = DiagnosticStatus.WARN, f"{unusable - unusable_then} unusable images of late; see the log"
-        elif behind > behind_then:
-            level = DiagnosticStatus.WARN
-            text = f"{behind - behind_then} frames of late have stamps before the last one and are skipped (~/reset)"
+            text = f"no image for {seconds:.0f} s on {topic}: {inputs.hint(topic)}"
+        elif starved := late.starved():
+            camera, why, count = starved
+            text = f"{count} frames of late on {camera} and none is used: {self._why(why, camera, inputs, companions)}"
+        elif late.of(Drop.UNUSABLE):
+            text = f"{late.of(Drop.UNUSABLE)} unusable images of late; see the log"
+        elif late.of(Drop.STAMP_BACK):
+            back = late.of(Drop.STAMP_BACK)
+            text = f"{back} frames of late have stamps before the last one and are skipped (~/reset)"
+        elif self._looks[-1][2] > refused_then:
+            text = f"{self._looks[-1][2] - refused_then} odometry samples of late are not taken; see the log"
         elif fleet is not None and fleet.problem:
-            level, text = DiagnosticStatus.WARN, fleet.sentence()
+            text = fleet.sentence()
+        elif missing := self._recognition.without_picture():
+            text = missing
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
         self.publish(level, text, self._values(rates, settings) | (fleet.values() if fleet is not None else {}))
+
+    def _why(self, why: Drop, camera: str, inputs: ImageInputs, companions: Companions) -> str:
+        """What keeps every frame of a camera from being used, in words."""
+        if why is Drop.NO_CAMERA_INFO:
+            return f"it waits for its camera info; {companions.waiting_for(camera)}"
+        return {
+            Drop.STAMP_REPEATED: "every header stamp is the same",
+            Drop.STAMP_BACK: f"their stamps lie before {inputs.last_stamp(camera)}, which it had (~/reset)",
+            Drop.UNUSABLE: "every image is unusable; see the log",
+        }.get(why, str(why))
 
     def _sentence(self, rates: tuple[float, float], settings: Settings) -> str:
         score = max(self._statistics.best_scores, default=None)
@@ -79,18 +97,21 @@ class Diagnostics:
         return f"{rates[1]:.1f} of {rates[0]:.1f} frames/s, {keyframes} keyframes, {best}"
 
     def _values(self, rates: tuple[float, float], settings: Settings) -> dict[str, str]:
-        received, processed, dropped = self._statistics.totals()
+        counts = self._statistics.counts()
         score = max(self._statistics.best_scores, default=None)
         stats = self._recognition.recognizer.database.stats()
         stages = self._recognition.recognizer.timer.summary_ms()
         return {
             "frames in [1/s]": f"{rates[0]:.2f}",
             "frames processed [1/s]": f"{rates[1]:.2f}",
-            "frames in": str(received),
-            "frames processed": str(processed),
-            **{f"dropped: {why}": str(dropped.get(why, 0)) for why in Drop},
+            "frames in": str(counts.received.total()),
+            "frames processed": str(counts.processed.total()),
+            **{f"dropped: {why}": str(counts.of(why)) for why in Drop},
             "keyframes": str(stats.keyframes),
             "keyframes evicted": str(stats.evicted),
+            "keyframes unreadable": str(stats.unreadable),
+            "keyframes without picture": str(stats.without_picture),
+            "odometry samples not taken": str(self._recognition.recognizer.odometry.refused),
             "memory [MB]": f"{stats.bytes_used / 1e6:.1f}",
             "memory budget [MB]": f"{stats.bytes_budget / 1e6:.1f}",
             "best score of late": "none" if score is None else f"{score:.3f}",

@@ -105,6 +105,10 @@ class ImageInputs:
         offers = "; ".join(sorted({f"{i.node_name}: {qos_in_words(i.qos_profile)}" for i in publishers}))
         return f"published by {offers}"
 
+    def last_stamp(self, topic: str) -> str:
+        """The newest stamp that was taken of a topic, in seconds."""
+        return in_seconds(self._stamps.last(topic))
+
     def _publishers(self, topic: str) -> list[Any]:
         return self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
 
@@ -135,7 +139,7 @@ class ImageInputs:
         def take(serialized: bytes) -> None:
             self._statistics.receive(topic)
             if self.paused:
-                self._statistics.drop(Drop.PAUSED)
+                self._statistics.drop(topic, Drop.PAUSED)
                 return
             stamp_ns = serialized_stamp(serialized)
             ruling = self._stamps.judge(topic, stamp_ns)
@@ -143,11 +147,11 @@ class ImageInputs:
                 self._tell(topic, ruling.verdict, stamp_ns, ruling.back_ns)
             if ruling.verdict not in (StampVerdict.USE, StampVerdict.NEW_SESSION):
                 self._statistics.drop(
-                    Drop.STAMP_REPEATED if ruling.verdict is StampVerdict.REPEATED else Drop.STAMP_BACK
+                    topic, Drop.STAMP_REPEATED if ruling.verdict is StampVerdict.REPEATED else Drop.STAMP_BACK
                 )
                 return
             if self._frames.put(WaitingFrame(topic, stamp_ns, ruling.session, serialized, message_type)):
-                self._statistics.drop(Drop.BUSY)
+                self._statistics.drop(topic, Drop.BUSY)
 
         return receive
 

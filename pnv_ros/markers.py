@@ -1,5 +1,6 @@
 """~/markers: keyframes and closures to look at in RViz or Foxglove."""
 
+import math
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -41,9 +42,11 @@ class PoseTrack:
         self.frame_id = ""
 
     def add(self, message: Any) -> None:
-        """Odometry or PoseStamped. A stamp that is not newer than the last one is ignored."""
+        """Odometry or PoseStamped. One that is not newer than the last or not finite is ignored."""
         pose = message.pose.pose if isinstance(message, Odometry) else message.pose
         stamp_ns = stamp_of(message)
+        if not all(math.isfinite(v) for v in (pose.position.x, pose.position.y, pose.position.z)):
+            return
         if self._stamps and stamp_ns <= self._stamps[-1]:
             if self._stamps[-1] - stamp_ns < 1_000_000_000:
                 return

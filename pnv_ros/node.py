@@ -2,21 +2,15 @@
 
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from rclpy.qos import qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo
 
-from msg_adapters.camera_info import Rectifier
-from msg_adapters.images import stamp_of
 from pnv_core.database import KeyframeDatabase
 from pnv_core.describe.describer import Describer, describer_from
 from pnv_core.errors import ConfigError, MapError, PnvError
@@ -25,6 +19,7 @@ from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
+from pnv_ros.companions import Companions
 from pnv_ros.diagnostics import Diagnostics
 from pnv_ros.fleet import start_fleet
 from pnv_ros.inputs import ImageInputs
@@ -61,7 +56,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._inputs: ImageInputs | None = None
         self._worker: Worker | None = None
         self._map: SavedMap | None = None
-        self._others: list[Any] = []
+        self._companions: Companions | None = None
         self._autosave: Autosave | None = None
         self.unsaved = False  # whether the last save of an autosaving node failed
         self._statistics = Statistics()
@@ -152,7 +147,9 @@ class PlaceRecognizerNode(LifecycleNode):
             raise PnvError(NOT_CONFIGURED)
         path = saved_map.path
         count = saved_map.load(recognition.still(), recognition.map_was_replaced)
-        return f"loaded {count} keyframes from {path}; a new session begins"
+        missing = recognition.without_picture()
+        rest = f"; {missing}" if missing else ""
+        return f"loaded {count} keyframes from {path}; a new session begins{rest}"
 
     def reset(self) -> str:
         recognition = self._recognition
@@ -189,7 +186,8 @@ class PlaceRecognizerNode(LifecycleNode):
         outputs = Outputs(self, config, describer.image_size, poses)
         self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
-        self._others = self._subscribe_others(recognizer, outputs, views, poses)
+        poses.offsets = dict(zip(config.image_topics, _triples(config.camera_in_base), strict=False))
+        self._companions = Companions(self, config, views, poses, recognizer.odometry, outputs.markers.track)
         self._map = SavedMap(database, describer.map_fingerprint)
         self._map.path = config.map_path
         if config.autosave and not config.load_on_start and self._map.exists():
@@ -246,43 +244,6 @@ class PlaceRecognizerNode(LifecycleNode):
             view.needs_info = bool(config.camera_info_topics)
         return views
 
-    def _subscribe_others(
-        self, recognizer: PlaceRecognizer, outputs: Outputs, views: dict[str, View], poses: RelativePoses
-    ) -> list[Any]:
-        """Camera infos, odometry and poses, where topics are given."""
-        config = self.settings.node
-        cameras = zip(config.camera_info_topics, config.image_topics, strict=False)
-        others = [
-            self.create_subscription(CameraInfo, topic, self._calibrate(camera, views[camera], poses), 1)
-            for topic, camera in cameras
-        ]
-
-        def odometry(message: Odometry) -> None:
-            position = message.pose.pose.position
-            recognizer.odometry.add(stamp_of(message), position.x, position.y, position.z)
-            if not config.pose_topic:
-                outputs.markers.track.add(message)
-
-        for kind, topic, receive in (
-            (Odometry, config.odometry_topic, odometry),
-            (PoseStamped, config.pose_topic, outputs.markers.track.add),
-        ):
-            if topic:
-                others.append(self.create_subscription(kind, topic, receive, qos_profile_sensor_data))
-        return others
-
-    def _calibrate(self, camera: str, view: View, poses: RelativePoses) -> Callable[[CameraInfo], None]:
-        def receive(info: CameraInfo) -> None:
-            try:
-                if view.rectifier is None or view.rectifier.size != (info.width, info.height):
-                    view.rectifier = Rectifier(info)
-                    poses.cameras[camera] = view.intrinsics()
-                    self.get_logger().info(f"images of {camera} are rectified as {info.width}x{info.height}")
-            except PnvError as error:
-                self.get_logger().warning(f"camera info of {camera}: {error}", throttle_duration_sec=10.0)
-
-        return receive
-
     def _settings_changed(self, settings: Settings) -> None:
         if self._recognition is not None:
             self._recognition.change(settings)
@@ -291,11 +252,13 @@ class PlaceRecognizerNode(LifecycleNode):
 
     def _every_second(self) -> None:
         recognition, inputs, diagnostics = self._recognition, self._inputs, self._diagnostics
-        if recognition is None or inputs is None or diagnostics is None:
+        companions = self._companions
+        if recognition is None or inputs is None or diagnostics is None or companions is None:
             return
         inputs.follow_types()
         inputs.report_mismatches()
-        diagnostics.look(self.settings, inputs)
+        companions.report_mismatches()
+        diagnostics.look(self.settings, inputs, companions)
         recognition.outputs.markers.publish(recognition.recognizer.database.refs, self.settings.node)
 
     def _stop(self) -> None:
@@ -324,11 +287,11 @@ class PlaceRecognizerNode(LifecycleNode):
             if self._recognition.fleet is not None:
                 self._recognition.fleet.close()
             self._recognition.outputs.close()
-            for subscription in self._others:
-                self.destroy_subscription(subscription)
+        if self._companions is not None:
+            self._companions.close()
         if self._diagnostics is not None:
             self._diagnostics.close()
-        self._recognition = self._diagnostics = self._map = None
+        self._recognition = self._companions = self._diagnostics = self._map = None
 
     def _changing_state(self, change: Callable[..., Any]) -> Callable[..., Any]:
         """A transition that the present state does not allow is answered with false, where rclpy raises."""
@@ -348,3 +311,7 @@ def _warm_up(describer: Describer) -> PlaceDescriptor:
     """Describe noise, so that the first real frame takes no longer than the others."""
     width, height = describer.image_size
     return describer.describe(np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8))
+
+
+def _triples(values: Sequence[float]) -> list[tuple[float, float, float]]:
+    return list(zip(values[::3], values[1::3], values[2::3], strict=True))

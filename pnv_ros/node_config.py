@@ -37,6 +37,14 @@ class NodeConfig:
         "",
         "nav_msgs/Odometry: rules closures out, scales ~/relative_pose; places keyframes where pose_topic is empty",
     )
+    camera_in_base: tuple[float, ...] = setting(
+        (),
+        "x, y, z of each camera in the robot's frame that odometry_topic moves: the camera's own way scales poses",
+        kind=float,
+        unit="m",
+        low=-100.0,
+        high=100.0,
+    )
     pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
 
     _time = Section("Time")
@@ -106,6 +114,12 @@ class NodeConfig:
             raise ConfigError(
                 f"camera_info_topics has {len(self.camera_info_topics)} entries; allowed: 0 or one per image topic"
             )
+        if len(self.camera_in_base) not in (0, 3 * len(topics)):
+            raise ConfigError(
+                f"camera_in_base has {len(self.camera_in_base)} entries; allowed: 0 or x, y, z per image topic"
+            )
+        if not self.frame_id.strip():
+            raise ConfigError(f"frame_id = {self.frame_id!r}; allowed: the name of a frame")
         for name in ("image_topics", "camera_info_topics", "odometry_topic", "pose_topic"):
             given = getattr(self, name)
             for topic in given if isinstance(given, tuple) else filter(None, [given]):

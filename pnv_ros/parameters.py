@@ -49,7 +49,11 @@ class Parameters:
 
     def _declare(self, setting: Setting, default: Any) -> Any:
         try:
-            value = self._node.declare_parameter(setting.name, _to_ros(default), descriptor_of(setting)).value
+            given = self._node._parameter_overrides.get(setting.name)
+            # an empty list of a parameter file has no type and arrives as nothing
+            empty = setting.many and given is not None and given.value is None
+            wanted = [] if empty else _to_ros(default)
+            value = self._node.declare_parameter(setting.name, wanted, descriptor_of(setting), empty).value
         except InvalidParameterValueException as error:
             raise ConfigError(f"{error}; allowed: {setting.allowed()}") from None
         return setting.check(_from_ros(value))

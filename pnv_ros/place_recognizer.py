@@ -1,5 +1,6 @@
 """The executable `place_recognizer`: one node, ended by SIGINT, SIGTERM or its own failure."""
 
+import re
 import signal
 import sys
 import threading
@@ -12,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from pnv_core.errors import PnvError
+from pnv_core.errors import PnvError, one_line
 from pnv_ros.node import PlaceRecognizerNode
 from pnv_ros.parameters import DECLARED
 
@@ -80,7 +81,11 @@ def main(args: list[str] | None = None) -> int:
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))
-    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:  # a parameter file that is no YAML, a flag that ROS does not know
+        print(f"place_recognizer: {one_line(_first_words(error))}", file=sys.stderr)
+        return UNUSABLE_INPUT
     try:
         try:
             node = PlaceRecognizerNode(failed=ending.put)
@@ -102,6 +107,11 @@ def main(args: list[str] | None = None) -> int:
         return 1 if isinstance(end, BaseException) or node.unsaved else 0
     finally:
         rclpy.try_shutdown()
+
+
+def _first_words(error: Exception) -> str:
+    """What rcl says before it lists the places in its source."""
+    return re.sub(r",? at \S+:\d+.*", "", str(error).splitlines()[0]) if str(error) else repr(error)
 
 
 if __name__ == "__main__":

@@ -72,6 +72,16 @@ class Recognition:
         self.outputs.new_session()
         self.outputs.markers.forget()
 
+    def without_picture(self) -> str:
+        """How many keyframes local features cannot examine although they should, in words; empty if none."""
+        stats = self.recognizer.database.stats()
+        if not self.recognizer.config.verify or not stats.without_picture:
+            return ""
+        return (
+            f"{stats.without_picture} of {stats.keyframes} keyframes have no picture (saved with verify: 0); "
+            "patches alone decide on them"
+        )
+
     def work(self, waiting: WaitingFrame) -> None:
         """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""
         with self._still:
@@ -83,7 +93,7 @@ class Recognition:
                 if self.fleet is not None:
                     self.fleet.change(self.recognizer.config)
             if waiting.session < self._session:  # waited here while another camera began a new session
-                self._statistics.drop(Drop.STAMP_BACK)
+                self._statistics.drop(waiting.camera, Drop.STAMP_BACK)
                 return
             if waiting.session > self._session:
                 self._session = waiting.session
@@ -91,7 +101,7 @@ class Recognition:
                 self.outputs.new_session()
             view = self.views[waiting.camera]
             if view.needs_info and view.rectifier is None:
-                self._statistics.drop(Drop.NO_CAMERA_INFO)
+                self._statistics.drop(waiting.camera, Drop.NO_CAMERA_INFO)
                 self._complain(f"{waiting.camera} info", f"frames of {waiting.camera} wait for its camera info")
                 return
             try:
@@ -99,7 +109,7 @@ class Recognition:
                 closures = self.recognizer.process(frame)
             except ImageError as error:
                 self._stamps.unusable(waiting.camera, waiting.stamp_ns)
-                count = self._statistics.drop(Drop.UNUSABLE)
+                count = self._statistics.drop(waiting.camera, Drop.UNUSABLE)
                 self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
                 return
             self._share()
@@ -107,7 +117,7 @@ class Recognition:
                 with self.recognizer.timer.stage("publish"):
                     self.outputs.publish(frame, closures, self._picture_of)
         accepted = sum(c.accepted for c in closures)
-        self._statistics.process(closures[0].score if closures else None, accepted, _in_words(closures))
+        self._statistics.process(waiting.camera, closures[0].score if closures else None, accepted, _in_words(closures))
         self._tell(closures, accepted)
 
     def _share(self) -> None:
@@ -119,7 +129,7 @@ class Recognition:
             self.fleet.offer(query, oldest_ns, self.outputs.markers.track.at(query.ref.stamp_ns))
 
     def _picture_of(self, keyframe: int) -> bytes:
-        return self.recognizer.database.descriptor(keyframe).thumbnail
+        return self.recognizer.database.picture(keyframe)
 
     def _unpacked(self, waiting: WaitingFrame) -> Frame:
         with self.recognizer.timer.stage("decode"):

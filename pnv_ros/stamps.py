@@ -67,6 +67,11 @@ class StampRule:
             self._advance(camera, stamp_ns)
             return Ruling(StampVerdict.NEW_SESSION, self._session, last - stamp_ns)
 
+    def last(self, camera: str) -> int:
+        """The newest stamp of a camera that counts; 0 where there is none."""
+        with self._lock:
+            return self._last.get(camera, 0)
+
     def unusable(self, camera: str, stamp_ns: int) -> None:
         """The frame of this stamp could not be used: its stamp must not hold back the next one."""
         with self._lock:

@@ -2,6 +2,7 @@
 
 import threading
 from collections import Counter, deque
+from dataclasses import dataclass
 from enum import StrEnum
 
 
@@ -25,8 +26,8 @@ class Statistics:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.received: Counter[str] = Counter()  # by camera
-        self.dropped: Counter[str] = Counter()  # by Drop
-        self.processed = 0
+        self._dropped: Counter[tuple[str, Drop]] = Counter()  # by camera and reason
+        self._processed: Counter[str] = Counter()  # by camera
         self.closures = 0
         self.last_closure = ""
         self.autosave_failure = ""  # of the last autosave; empty where it succeeded
@@ -36,23 +37,52 @@ class Statistics:
         with self._lock:
             self.received[camera] += 1
 
-    def drop(self, why: Drop) -> int:
-        """How many were dropped for this reason so far, this one included."""
+    def drop(self, camera: str, why: Drop) -> int:
+        """How many of a camera were dropped for this reason so far, this one included."""
         with self._lock:
-            self.dropped[why] += 1
-            return self.dropped[why]
+            self._dropped[camera, why] += 1
+            return self._dropped[camera, why]
 
-    def process(self, best_score: float | None, accepted: int, closure: str) -> None:
+    def process(self, camera: str, best_score: float | None, accepted: int, closure: str) -> None:
         """One frame went through the recogniser."""
         with self._lock:
-            self.processed += 1
+            self._processed[camera] += 1
             self.closures += accepted
             if best_score is not None:
                 self.best_scores.append(best_score)
             if accepted:
                 self.last_closure = closure
 
-    def totals(self) -> tuple[int, int, dict[str, int]]:
-        """Frames received and processed, and dropped by reason."""
+    def counts(self) -> "Counts":
+        """Everything counted so far."""
         with self._lock:
-            return sum(self.received.values()), self.processed, dict(self.dropped)
+            return Counts(Counter(self.received), Counter(self._processed), Counter(self._dropped))
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Frames by camera: received, processed, and dropped by reason."""
+
+    received: Counter[str]
+    processed: Counter[str]
+    dropped: Counter[tuple[str, Drop]]
+
+    def since(self, earlier: "Counts") -> "Counts":
+        return Counts(
+            self.received - earlier.received, self.processed - earlier.processed, self.dropped - earlier.dropped
+        )
+
+    def of(self, why: Drop) -> int:
+        """Dropped for a reason, over all cameras."""
+        return sum(n for (_, reason), n in self.dropped.items() if reason is why)
+
+    def starved(self) -> tuple[str, Drop, int] | None:
+        """A camera of which frames came and none was processed, the reason, and of how many; None if there is none.
+
+        One that waits for the worker is not starved.
+        """
+        for camera, received in self.received.items():
+            reasons = [(n, why) for (c, why), n in self.dropped.items() if c == camera and why is not Drop.BUSY]
+            if reasons and not self.processed[camera]:
+                return camera, max(reasons)[1], received
+        return None

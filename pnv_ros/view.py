@@ -28,9 +28,10 @@ class View:
         """Raises ImageError where nothing is left of the image."""
         height, width = frame.rgb.shape[:2]
         rgb, valid = frame.rgb, self._valid(width, height)
-        if self.rectifier is not None:
+        rectifier = self.rectifier  # may be replaced by another thread
+        if rectifier is not None:
             seen = np.full((height, width), 255, np.uint8) if valid is None else valid
-            rgb, valid = self.rectifier(rgb), self.rectifier(seen)
+            rgb, valid = rectifier(rgb), rectifier(seen)
         left, top, right, bottom = self._crop
         if width - left - right < MIN_SIDE or height - top - bottom < MIN_SIDE:
             raise ImageError(f"crop = {list(self._crop)} leaves {width - left - right}x{height - top - bottom} of a "
@@ -39,11 +40,10 @@ class View:
         return dataclasses.replace(frame, rgb=np.ascontiguousarray(rgb[window]),
                                    valid=None if valid is None else valid[window] > 127)  # fmt: skip
 
-    def intrinsics(self) -> Intrinsics:
-        """Of the images this view gives. To be called once the rectifier is known; raises ConfigError."""
-        assert self.rectifier is not None
-        (fx, fy, cx, cy), (left, top, right, _) = self.rectifier.focal_and_centre, self._crop
-        return Intrinsics.of_pixels(fx, fy, cx - left, cy - top, self.rectifier.size[0] - left - right)
+    def intrinsics(self, rectifier: Rectifier) -> Intrinsics:
+        """Of the images this view gives with a rectifier. Raises ConfigError."""
+        (fx, fy, cx, cy), (left, top, right, _) = rectifier.focal_and_centre, self._crop
+        return Intrinsics.of_pixels(fx, fy, cx - left, cy - top, rectifier.size[0] - left - right)
 
     def _valid(self, width: int, height: int) -> NDArray[np.uint8] | None:
         if self._mask is None or self._mask.shape == (height, width):

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pnv_core.describe.describer import Describer
 
 MB = 1_000_000
+_COUNTS = ("read_only", "_evicted", "_unreadable")  # of a database that goes on when its contents are replaced
 # Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
 OBJECT_BYTES = 2000
 
@@ -86,6 +87,8 @@ class DatabaseStats:
     evicted: int
     sessions: int
     disk_bytes: int = 0
+    without_picture: int = 0  # keyframes that local features cannot examine
+    unreadable: int = 0  # keyframes given up because the disk could not read them
 
 
 def bytes_needed(dim: int, keyframes: int, patch_bytes: int) -> int:
@@ -153,6 +156,7 @@ class KeyframeDatabase:
         self._session = 0
         self._next_id = 0
         self._evicted = 0
+        self._unreadable = 0
         self._layouts: dict[tuple[GridLayout, ...], tuple[GridLayout, ...]] = {}
         self._start_empty()
 
@@ -168,6 +172,7 @@ class KeyframeDatabase:
         self._sequences: dict[tuple[int, str], list[int]] = {}  # ascending ids by (session, camera)
         self._cameras: dict[str, int] = {}
         self._patch_bytes = 0
+        self._pictures = 0
 
     @classmethod
     def for_describer(cls, describer: "Describer", *, read_only: bool = False) -> "KeyframeDatabase":
@@ -230,6 +235,8 @@ class KeyframeDatabase:
                 evicted=self._evicted,
                 sessions=len(np.unique(self._table.sessions[: self._table.high][self._table.live[: self._table.high]])),
                 disk_bytes=self._patch_file.end if self._patch_file else 0,
+                without_picture=len(self._ids) - self._pictures,
+                unreadable=self._unreadable,
             )
 
     def add(self, stamp_ns: int, camera: str, descriptor: PlaceDescriptor) -> ImageRef:
@@ -302,6 +309,7 @@ class KeyframeDatabase:
         self._ids.append(ref.id)
         self._sequences.setdefault((ref.session, ref.camera), []).append(ref.id)
         self._patch_bytes += len(buffer)
+        self._pictures += len(buffer) > buffer_bytes(layouts)
         self._in_memory[ref.id] = None
         self._index.add(row.slot)
         self._eviction.added(ref, kept)
@@ -311,6 +319,7 @@ class KeyframeDatabase:
         del self._ids[bisect_left(self._ids, keyframe)]
         sequence = self._sequences[stored.ref.session, stored.ref.camera]
         del sequence[bisect_left(sequence, keyframe)]
+        self._pictures -= stored.buffer.nbytes > buffer_bytes(stored.layouts)
         if keyframe in self._in_memory:
             self._patch_bytes -= stored.buffer.nbytes
             del self._in_memory[keyframe]
@@ -351,6 +360,27 @@ class KeyframeDatabase:
     def descriptor(self, keyframe: int) -> PlaceDescriptor:
         """What is stored of a keyframe; its patches are float16 when stored as float16, float32 otherwise."""
         return self._keyframes[keyframe].descriptor(self.cell)
+
+    def readable(self, keyframes: Iterable[int]) -> dict[int, PlaceDescriptor]:
+        """What is stored of these keyframes. One that the disk cannot read is given up, counted and said."""
+        found = {}
+        for keyframe in keyframes:
+            try:
+                found[keyframe] = self.descriptor(keyframe)
+            except OSError as error:
+                with self._lock:
+                    self._remove(keyframe)
+                    self._unreadable += 1
+                _log.warning("keyframe %d is given up: %s", keyframe, error)
+        return found
+
+    def picture(self, keyframe: int) -> bytes:
+        """The small picture of a keyframe; empty where none is kept, or the keyframe is gone or unreadable."""
+        stored = self._keyframes.get(keyframe)
+        try:
+            return b"" if stored is None else stored.read()[buffer_bytes(stored.layouts) :].tobytes()
+        except OSError:
+            return b""
 
     def patches(self, keyframe: int) -> tuple[PatchCodes, ...]:
         """The patches of a keyframe exactly as stored, one PatchCodes per patch size (int8 with its scales)."""
@@ -440,7 +470,7 @@ class KeyframeDatabase:
         """Take over the contents of a `prepared` database at once. Gives the lineage of later snapshots."""
         with self._lock:
             before = self._keyframes
-            vars(self).update(vars(prepared) | {"read_only": self.read_only, "_evicted": self._evicted})
+            vars(self).update(vars(prepared) | {n: vars(self)[n] for n in _COUNTS})
             lineage = self._lineage
         _let_go(before)
         return lineage

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pnv_core.config import Config
 from pnv_core.decide.calibration import CHANCE
 from pnv_core.decide.consistency import DOUBT, PRIOR, SequenceMemory, confirmed, window_of
-from pnv_core.types import Evidence, LoopClosure, Reason
+from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
 
@@ -27,7 +27,7 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
     belief = max(closure.score, path.belief) if agreed else closure.score
     if belief < config.accept_score:
         return replace(closure, reason=Reason.LOW_SCORE)
-    if config.verify and evidence.local_inliers < 0:
+    if config.verify and evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE:
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)

@@ -8,7 +8,7 @@ import numpy as np
 from pnv_core.config import Config
 from pnv_core.decide.calibration import Calibration, calibration_for
 from pnv_core.decide.consistency import Steps, by_id
-from pnv_core.types import Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
+from pnv_core.types import NO_PICTURE, Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
 from pnv_core.verify.reranker import Reranker, SpatialResult
 from pnv_core.verify.verifier import VERIFIERS, hull_area
 
@@ -39,7 +39,8 @@ class Judge:
 
         `references` is what is stored of the first candidates; the others are refused as not re-ranked.
         `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
-        `config.verify` best are examined by local features where both images have a thumbnail. An image with less
+        `config.verify` best are examined by local features where both images have a thumbnail; where one has none, the
+        evidence is missing and the calibration of patches alone decides. An image with less
         texture than `config.min_texture` scores 0.
         """
         scored = self.reranker.scores(descriptor, references)
@@ -57,6 +58,7 @@ class Judge:
                 recent_lead=similarity - predecessor,
                 spatial_lead=min((result.score - scored[i].score for i in elsewhere if i < len(scored)), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
+                local_inliers=-1 if reference.thumbnail else NO_PICTURE,
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
         found.sort(key=lambda pair: rank(pair[0]))
@@ -71,9 +73,10 @@ class Judge:
                 seen = replace(evidence, local_inliers=check.inliers, local_spread=check.spread)
                 verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
                 found[place] = verified, seen, number
-        # what ranked lower and was not examined is not believed more than what was
+        # what ranked lower and was not examined is not believed more than what was; what has no picture stands by
+        # what its patches say
         most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
-        closures = [c if e.local_inliers >= 0 else replace(c, score=min(c.score, most)) for c, e, _ in found]
+        closures = [replace(c, score=min(c.score, most)) if e.local_inliers == -1 else c for c, e, _ in found]
         closures = [self._beside_rivals(c, closures) for c in closures]
         rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
         return sorted(closures + rest, key=rank)

@@ -1,25 +1,60 @@
-"""What odometry says against a closure. Positions in metres in the odometry's own frame."""
+"""What odometry says against a closure. Positions in metres in the odometry's own frame.
+
+Nothing is taken for granted: odometry trembles while the robot stands, jumps when it is initialised anew, and carries
+stamps of other clocks. The way gone is therefore measured between anchors at least NOISE_M apart, and a sample that
+does not follow from the last one counts only once others have followed from it.
+"""
 
 import math
 import threading
 from bisect import bisect_left
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 from pnv_core.types import ImageRef
 
+NOISE_M = 0.2  # less is no way gone: forty times the tremble of 5 mm that wheel and visual odometry show at rest
+FASTEST_M_S = 200.0  # what drives is slower
+LONGEST_GAP_NS = 60_000_000_000
+FOLLOWERS = 3  # samples that follow from one another before a jump is believed
+FARTHEST_M = 1e7  # coordinates of no map reach farther
 _KEPT = 20_000  # latest samples, some minutes at 50 Hz
 _KEYFRAMES = 200_000  # about 20 MB
 _NEAR_NS = 500_000_000  # a position holds for images this close in time
 _STEP_BACK_NS = 1_000_000_000
 
 
+class Refusal(StrEnum):
+    """Why a sample was not taken."""
+
+    NOT_FINITE = "not finite, or farther than any map reaches"
+    LATE = "not newer than the last one"
+    JUMP = "a jump in place or time that nothing has followed yet"
+
+
 @dataclass(frozen=True)
 class Position:
-    """Where odometry places the robot, and the way it has gone since the start."""
+    """Where odometry places the robot, how it is turned, and the way it has gone since the start."""
 
     xyz: tuple[float, float, float]
     travelled_m: float
+    quaternion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)  # x, y, z, w; of length 1
+
+    def of(self, offset: Sequence[float]) -> tuple[float, float, float]:
+        """Where a point fixed to the robot is, such as a camera at `offset` (x, y, z) in the robot's own frame."""
+        x, y, z, w = self.quaternion
+        a, b, c = offset
+        turned = (
+            (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * w) * b + 2 * (x * z + y * w) * c,
+            2 * (x * y + z * w) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * w) * c,
+            2 * (x * z - y * w) * a + 2 * (y * z + x * w) * b + (1 - 2 * (x * x + y * y)) * c,
+        )
+        return self.xyz[0] + turned[0], self.xyz[1] + turned[1], self.xyz[2] + turned[2]
+
+
+Sample = tuple[int, tuple[float, float, float], tuple[float, float, float, float]]  # stamp, position, quaternion
 
 
 class Odometry:
@@ -33,20 +68,65 @@ class Odometry:
         self._stamps: deque[int] = deque(maxlen=_KEPT)
         self._positions: deque[Position] = deque(maxlen=_KEPT)
         self._keyframes: dict[tuple[int, int], Position] = {}  # by (session, id)
+        self._anchor = (0.0, 0.0, 0.0)  # up to where the way is counted
+        self._jumped: list[Sample] = []  # samples that do not follow from the last one, but from one another
         self._lock = threading.RLock()
+        self.refused = 0
 
-    def add(self, stamp_ns: int, x: float, y: float, z: float) -> None:
-        """A sample. One that is not finite or not newer is passed over; a step back in time starts anew."""
-        if not all(map(math.isfinite, (x, y, z))):
-            return
+    def add(
+        self, stamp_ns: int, x: float, y: float, z: float, quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+    ) -> Refusal | None:
+        """A sample; `quaternion` (x, y, z, w) says how the robot is turned. Gives the reason where it is not taken.
+
+        Once FOLLOWERS samples follow from one another after a jump in place or a step back in time, another run has
+        begun and odometry starts anew; after a gap it goes on.
+        """
         with self._lock:
-            if self._stamps and stamp_ns <= self._stamps[-1]:
-                if stamp_ns > self._stamps[-1] - _STEP_BACK_NS:
-                    return
-                self.forget()
-            last = self._positions[-1] if self._positions else Position((x, y, z), 0.0)
-            self._stamps.append(stamp_ns)
-            self._positions.append(Position((x, y, z), last.travelled_m + math.dist(last.xyz, (x, y, z))))
+            refusal = self._taken(stamp_ns, (x, y, z), quaternion)
+            self.refused += refusal is not None
+            return refusal
+
+    def _taken(self, stamp_ns: int, xyz: tuple[float, float, float], quaternion: Sequence[float]) -> Refusal | None:
+        length = math.hypot(*quaternion)
+        if not all(abs(v) <= FARTHEST_M for v in xyz) or not 0.5 < length < 2.0:  # false for NaN
+            return Refusal.NOT_FINITE
+        x, y, z, w = (v / length for v in quaternion)
+        sample = stamp_ns, xyz, (x, y, z, w)
+        if not self._stamps or self._follows(sample, self._stamps[-1], self._positions[-1].xyz):
+            self._jumped.clear()
+            self._append(sample)
+            return None
+        if 0 <= self._stamps[-1] - stamp_ns < _STEP_BACK_NS:
+            return Refusal.LATE
+        if self._jumped and not self._follows(sample, *self._jumped[-1][:2]):
+            self._jumped.clear()
+        self._jumped.append(sample)
+        if len(self._jumped) < FOLLOWERS:
+            return Refusal.JUMP
+        begun, self._jumped = self._jumped, []
+        if not self._reachable(begun[0], self._stamps[-1], self._positions[-1].xyz):
+            self.forget()
+        for one in begun:
+            self._append(one)
+        return None
+
+    @staticmethod
+    def _reachable(sample: Sample, stamp_ns: int, xyz: tuple[float, float, float]) -> bool:
+        seconds = (sample[0] - stamp_ns) / 1e9
+        return seconds > 0 and math.dist(sample[1], xyz) <= NOISE_M + FASTEST_M_S * seconds
+
+    def _follows(self, sample: Sample, stamp_ns: int, xyz: tuple[float, float, float]) -> bool:
+        return sample[0] - stamp_ns <= LONGEST_GAP_NS and self._reachable(sample, stamp_ns, xyz)
+
+    def _append(self, sample: Sample) -> None:
+        stamp_ns, xyz, quaternion = sample
+        travelled_m = self._positions[-1].travelled_m if self._positions else 0.0
+        step_m = math.dist(self._anchor, xyz) if self._positions else math.inf
+        if step_m >= NOISE_M:
+            travelled_m += step_m if self._positions else 0.0
+            self._anchor = xyz
+        self._stamps.append(stamp_ns)
+        self._positions.append(Position(xyz, travelled_m, quaternion))
 
     def remember(self, keyframe: ImageRef) -> None:
         """Note where a keyframe was taken, if that is known."""
@@ -63,6 +143,7 @@ class Odometry:
             self._stamps.clear()
             self._positions.clear()
             self._keyframes.clear()
+            self._jumped.clear()
 
     def at(self, stamp_ns: int) -> Position | None:
         """The position nearest in time, within half a second."""

@@ -33,7 +33,7 @@ from pnv_core.maps.manifest import (
     write_manifest,
 )
 from pnv_core.maps.reading import open_map
-from pnv_core.maps.segment import SegmentHeader, SegmentWriter
+from pnv_core.maps.segment import SavedKeyframe, SegmentHeader, SegmentWriter
 from pnv_core.types import ImageRef
 
 SEGMENT_BYTES = 64_000_000  # a segment is closed beyond this, so that a rolling map frees disk in small steps
@@ -50,11 +50,14 @@ class SaveReport:
     keyframes: int
     written: int  # keyframes written anew
     bytes_written: int
+    unreadable: int = 0  # keyframes left out because the disk could not read their patches
     kept: Path | None = None  # where the map is now that was there before and that this one does not continue
 
     def __str__(self) -> str:
         kept = "" if self.kept is None else f"; the map before a reset or load is kept at {self.kept}"
-        return f"{self.path}: {self.keyframes} keyframes, {self.written} new ({self.bytes_written / 1e6:.1f} MB){kept}"
+        lost = f"; {self.unreadable} unreadable ones are left out" if self.unreadable else ""
+        size = f"{self.bytes_written / 1e6:.1f} MB"
+        return f"{self.path}: {self.keyframes} keyframes, {self.written} new ({size}){lost}{kept}"
 
 
 class MapStore:
@@ -143,9 +146,8 @@ class MapStore:
         live: dict[int, KeyframeRecord] = {kf.ref.id: kf for kf in snapshot.keyframes}
         snapshot.keyframes.clear()  # from here on a keyframe is let go once written
         kept = _kept_segments(known.segments if known else (), live)
-        sessions = sessions_of(kf.ref for kf in live.values())
-        cameras = tuple(dict.fromkeys(kf.ref.camera for kf in live.values()))
-        keyframes = len(live)
+        refs = {i: kf.ref for i, kf in live.items()}
+        cameras = tuple(dict.fromkeys(ref.camera for ref in refs.values()))
         for segment in kept:
             for i in ids_of(segment.live):
                 del live[i]
@@ -156,31 +158,42 @@ class MapStore:
             and known is not None
             and (known.next_id, known.next_session) == (snapshot.next_id, snapshot.next_session)
         ):
-            return known, SaveReport(self.path, keyframes, 0, 0)
+            return known, SaveReport(self.path, len(refs), 0, 0)
         generation = _next_generation(self.path)
         header = SegmentHeader(
             self.fingerprint, snapshot.dim, cameras, tuple({kf.layouts: None for kf in live.values()})
         )
         borders = [_first_id(segment) for segment in kept]
-        written = write_segments(self.path, generation, header, _drain(live), borders)
+        unreadable: list[int] = []
+        written = write_segments(self.path, generation, header, _drain(live, unreadable), borders)
+        for i in unreadable:
+            del refs[i]
         manifest = Manifest(
             self.fingerprint,
             snapshot.dim,
             generation,
             snapshot.next_id,
             snapshot.next_session,
-            keyframes,
+            len(refs),
             cameras,
-            sessions,
+            sessions_of(refs.values()),
             tuple(sorted((*kept, *written), key=_first_id)),
         )
         commit(self.path, manifest, written)
-        return manifest, SaveReport(self.path, keyframes, unsaved, sum(s.bytes for s in written))
+        new = unsaved - len(unreadable)
+        return manifest, SaveReport(self.path, len(refs), new, sum(s.bytes for s in written), len(unreadable))
 
 
-def _drain(live: dict[int, KeyframeRecord]) -> Iterator[KeyframeRecord]:
+def _drain(live: dict[int, KeyframeRecord], unreadable: list[int]) -> Iterator[SavedKeyframe]:
+    """The keyframes one by one, read before anything is written of them; the ids of those that cannot be are noted."""
     for i in list(live):
-        yield live.pop(i)
+        kf = live.pop(i)
+        try:
+            buffer = kf.read()
+        except OSError:
+            unreadable.append(i)
+            continue
+        yield SavedKeyframe(kf.ref, kf.vector, kf.layouts, buffer, kf.texture)
 
 
 def _kept_segments(segments: Iterable[Segment], live: dict[int, KeyframeRecord]) -> list[Segment]:

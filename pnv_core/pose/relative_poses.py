@@ -21,11 +21,15 @@ _LONGEST_BASELINE_M = 5.0
 
 
 class RelativePoses:
-    """Poses from the small pictures a recogniser keeps. `cameras` holds the intrinsics of every calibrated camera."""
+    """Poses from the small pictures a recogniser keeps. `cameras` holds the intrinsics of every calibrated camera.
+
+    `offsets` (x, y, z) in metres say where cameras sit on the robot that odometry speaks of; else in its origin.
+    """
 
     def __init__(self, recognizer: PlaceRecognizer, cameras: dict[str, Intrinsics] | None = None) -> None:
         self._recognizer = recognizer
         self.cameras = cameras if cameras is not None else {}
+        self.offsets: dict[str, tuple[float, float, float]] = {}
 
     def of(self, closure: LoopClosure, depth: NDArray[np.floating] | None = None) -> RelativePose | None:
         """The query's camera in the frame of the match's. `depth` (h, w) in metres belongs to the query's image.
@@ -50,7 +54,8 @@ class RelativePoses:
         there = self._recognizer.odometry.at(before[0].stamp_ns) if before else None
         if here is None or there is None:
             return None
-        baseline = math.dist(here.xyz, there.xyz)
+        offset = self.offsets.get(closure.query.camera, (0.0, 0.0, 0.0))
+        baseline = math.dist(here.of(offset), there.of(offset))
         if not _LEAST_BASELINE_M <= baseline <= _LONGEST_BASELINE_M:
             return None
         neighbour = self._check(closure.query, before[0])
@@ -61,7 +66,7 @@ class RelativePoses:
         database = self._recognizer.database
         if query.id not in database or other.id not in database:
             return None
-        pictures = [database.descriptor(ref.id).thumbnail for ref in (query, other)]
+        pictures = [database.picture(ref.id) for ref in (query, other)]
         if not all(pictures):
             return None
         return self._recognizer.judge.verifier.check(pictures[0], query.camera, pictures[1], other.camera)

@@ -11,15 +11,15 @@ import pytest
 from pnv_core.database import KeyframeDatabase
 from pnv_core.maps import MapStore
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.types import Frame
+from pnv_core.types import NO_PICTURE, Frame
 from test.core.small import small_describer
 from test.database.synthetic import SECOND
 
 SETTINGS = {"min_interval_s": 0.0, "min_change": 0.0, "accept_score": 0.0, "sure_score": 0.0, "patch_precision": "int8"}
 
 
-def _recognizer(read_only: bool) -> PlaceRecognizer:
-    describer = small_describer(**SETTINGS)
+def _recognizer(read_only: bool, **more) -> PlaceRecognizer:
+    describer = small_describer(**SETTINGS | more)
     database = KeyframeDatabase.for_describer(describer, read_only=read_only)
     return PlaceRecognizer(describer, database)
 
@@ -48,6 +48,20 @@ def visit(path: str) -> None:
     recognizer = _recognizer(read_only=True)
     MapStore(path, recognizer.describer.fingerprint).load(recognizer.database)
     print(json.dumps(_closures(recognizer)))
+
+
+def test_a_map_without_pictures_is_judged_by_what_it_has_and_it_is_said(tmp_path):
+    maker, finder = _recognizer(read_only=False, verify=0), _recognizer(read_only=True, verify=3)
+    for frame in _frames(0, 0):
+        maker.process(frame)
+    MapStore(tmp_path / "map", maker.describer.fingerprint).save(maker.database.snapshot())
+    MapStore(tmp_path / "map", finder.describer.fingerprint).load(finder.database)
+    assert finder.database.stats().without_picture == 8
+    maker.new_session()
+    maker.database.read_only = True
+    without, found = _closures(maker), _closures(finder)
+    assert [c[0] for c in found if c[3]] == [c[0] for c in without if c[3]] != []
+    assert {c.evidence.local_inliers for f in _frames(2000, 16) for c in finder.process(f)} == {NO_PICTURE}
 
 
 @pytest.mark.process

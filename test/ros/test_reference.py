@@ -47,11 +47,42 @@ def test_every_parameter_is_described_with_its_range():
 
 
 class _Call:
-    """Remembers what a launch file constructs."""
+    """Remembers what a launch file constructs, and takes what launch 3.4.3 (Jazzy) takes."""
+
+    SUBSTITUTIONS = ("LaunchConfiguration", "PathJoinSubstitution", "FindPackageShare")
+    TEXTS = ("default_value", "namespace", "executable", "package", "name", "cmd")  # text or a flat list
 
     def __init__(self, name, log, *args, **kwargs):
         self.name, self.args, self.kwargs = name, args, kwargs
         log.append(self)
+        if name in self.SUBSTITUTIONS:
+            for part in args:
+                _check_substitutions(part)
+        for key in self.TEXTS:
+            if key in kwargs:
+                _check_substitutions(kwargs[key])
+        if name == "Node":
+            for pair in kwargs.get("remappings", ()):
+                for side in pair:
+                    _check_substitutions(side)
+            for part in kwargs["parameters"]:
+                if not isinstance(part, dict):
+                    _check_substitutions(part)
+
+
+def _check_substitutions(given):
+    """Text, a substitution, or a flat list of both, which launch 3.4.3 normalizes; a list in a list it refuses."""
+    for part in given if isinstance(given, list | tuple) else [given]:
+        if not isinstance(part, str) and getattr(part, "name", None) not in _Call.SUBSTITUTIONS:
+            raise TypeError(f"Failed to normalize given item of type {type(part)!r}")
+
+
+def test_the_stand_in_refuses_what_launch_3_4_3_refuses():
+    log = []
+    preset = _Call("LaunchConfiguration", log, "preset")
+    _Call("PathJoinSubstitution", log, ["config", preset])
+    with pytest.raises(TypeError, match="normalize"):
+        _Call("PathJoinSubstitution", log, ["config", [preset, ".yaml"]])
 
 
 def _stubs(log):
@@ -96,10 +127,10 @@ def test_launch_files_name_only_what_exists(path, monkeypatch):
     for name in set(declared) & set(DECLARED):
         if "default_value" in declared[name]:
             DECLARED[name].check(yaml.safe_load(declared[name]["default_value"] or "''"))
-    for join in (c for c in log if c.name == "PathJoinSubstitution"):
-        _, folder, (argument, suffix) = join.args[0]
+    for files in (kwargs["default_value"] for name, kwargs in declared.items() if name == "params_file"):
+        _, folder, argument, suffix = files
         assert argument.args == ("preset",)
-        assert all((ROOT / folder / (preset + suffix)).is_file() for preset in PRESETS)
+        assert all((ROOT / (folder.strip("/")) / (preset + suffix)).is_file() for preset in PRESETS)
 
 
 def test_there_is_a_launch_file_for_a_bag_and_one_for_two_cameras():

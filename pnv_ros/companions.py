@@ -1,0 +1,115 @@
+"""What comes beside the images: camera infos, odometry and poses, where topics are given."""
+
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import qos_policy_name_from_kind, qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo
+
+from msg_adapters.camera_info import Rectifier, calibration_of
+from msg_adapters.images import stamp_of
+from pnv_core.decide.odometry import Odometry as OdometryMemory
+from pnv_core.errors import PnvError
+from pnv_core.pose.relative_poses import RelativePoses
+from pnv_ros.inputs import qos_in_words
+from pnv_ros.markers import PoseTrack
+from pnv_ros.node_config import NodeConfig
+from pnv_ros.view import View
+
+_REPEAT_S = 10.0  # the same complaint is not made more often
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether an image topic carries rectified images by its name, as image_proc and camera drivers name them."""
+    return any(part.startswith("image_rect") for part in topic.split("/"))
+
+
+class Companions:
+    """The subscriptions of a configured node beside its images. Sensor-data QoS, which any publisher satisfies."""
+
+    def __init__(
+        self, node: Node, config: NodeConfig, views: dict[str, View], poses: RelativePoses, odometry: OdometryMemory,
+        track: PoseTrack,
+    ) -> None:  # fmt: skip
+        self._node, self._views, self._poses, self._odometry, self._track = node, views, poses, odometry, track
+        self._calibrations: dict[str, tuple[Any, ...]] = {}
+        self._mismatches: dict[str, str] = {}  # topic: policy
+        self._subscriptions: dict[str, Any] = {}
+        self._info_topics = dict(zip(config.image_topics, config.camera_info_topics, strict=False))
+        for camera, topic in self._info_topics.items():
+            self._subscribe(CameraInfo, topic, self._calibrate(camera))
+        if config.odometry_topic:
+            shown = None if config.pose_topic else track
+            self._subscribe(Odometry, config.odometry_topic, self._odometry_came(shown))
+        if config.pose_topic:
+            self._subscribe(PoseStamped, config.pose_topic, track.add)
+
+    def close(self) -> None:
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+
+    def waiting_for(self, camera: str) -> str:
+        """Why a camera has no CameraInfo yet, in words."""
+        topic = self._info_topics[camera]
+        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
+        kinds = sorted({p.topic_type for p in publishers} - {"sensor_msgs/msg/CameraInfo"})
+        if not publishers:
+            return f"nobody publishes {topic}"
+        return f"{topic} is published as {kinds[0]}" if kinds else f"{topic} has carried no usable CameraInfo"
+
+    def report_mismatches(self) -> None:
+        """Say which publishers cannot be heard."""
+        for topic, policy in list(self._mismatches.items()):
+            del self._mismatches[topic]
+            ours = qos_in_words(self._subscriptions[topic].qos_profile)
+            self._node.get_logger().warning(
+                f"a publisher of {topic} is not heard: its {policy} does not suit {ours}"
+            )
+
+    def _subscribe(self, kind: type, topic: str, receive: Callable[[Any], None]) -> None:
+        def mismatch(info: Any) -> None:
+            self._mismatches[topic] = qos_policy_name_from_kind(info.last_policy_kind).lower()
+
+        self._subscriptions[topic] = self._node.create_subscription(
+            kind, topic, receive, qos_profile_sensor_data,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=mismatch),
+        )  # fmt: skip
+
+    def _odometry_came(self, track: PoseTrack | None) -> Callable[[Odometry], None]:
+        def receive(message: Odometry) -> None:
+            p, q = message.pose.pose.position, message.pose.pose.orientation
+            refusal = self._odometry.add(stamp_of(message), p.x, p.y, p.z, (q.x, q.y, q.z, q.w))
+            if refusal is not None:
+                self._node.get_logger().warning(
+                    f"odometry at {p.x:.6g}, {p.y:.6g}, {p.z:.6g} m is not taken: {refusal} "
+                    f"({self._odometry.refused} so far)", throttle_duration_sec=_REPEAT_S,
+                )  # fmt: skip
+            elif track is not None:
+                track.add(message)
+
+        return receive
+
+    def _calibrate(self, camera: str) -> Callable[[CameraInfo], None]:
+        view = self._views[camera]
+
+        def receive(info: CameraInfo) -> None:
+            calibration = calibration_of(info)
+            if calibration == self._calibrations.get(camera):
+                return
+            try:
+                rectifier = Rectifier(info, rectified=is_rectified(camera))
+                self._poses.cameras[camera] = view.intrinsics(rectifier)
+            except PnvError as error:
+                self._node.get_logger().warning(f"camera info of {camera}: {error}", throttle_duration_sec=_REPEAT_S)
+                return
+            again = "anew " if camera in self._calibrations else ""
+            self._calibrations[camera], view.rectifier = calibration, rectifier
+            done = "taken as rectified, by their name, at" if is_rectified(camera) else "rectified as"
+            self._node.get_logger().info(f"images of {camera} are {again}{done} {info.width}x{info.height}")
+
+        return receive
