@@ -70,7 +70,11 @@ def main(args: list[str] | None = None) -> int:
 
     1 too where autosave is on and the last save failed.
     """
-    others = remove_ros_args(sys.argv if args is None else [sys.argv[0], *args])[1:]
+    try:
+        others = remove_ros_args(sys.argv if args is None else [sys.argv[0], *args])[1:]
+    except Exception as error:  # a parameter file that is no YAML, a flag that ROS does not know
+        print(f"place_recognizer: {one_line(_first_words(error))}", file=sys.stderr)
+        return UNUSABLE_INPUT
     if "--help" in others or "-h" in others:
         print(help_text())
         return 0
@@ -81,11 +85,7 @@ def main(args: list[str] | None = None) -> int:
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))
-    try:
-        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # a parameter file that is no YAML, a flag that ROS does not know
-        print(f"place_recognizer: {one_line(_first_words(error))}", file=sys.stderr)
-        return UNUSABLE_INPUT
+    rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     try:
         try:
             node = PlaceRecognizerNode(failed=ending.put)
