@@ -32,7 +32,7 @@ async function look(){try{
   const s=await (await fetch("state.json")).json(),q=s.queries,v=s.values;
   $("words").textContent=s.message;$("words").style.color=s.level?"#d55e00":"";
   $("values").textContent=["frames processed [1/s]","keyframes","closures","memory [MB]"]
-    .filter(k=>k in v).map(k=>k+" "+v[k]).join("   ");
+    .filter(k=>k in v).map(k=>k+" "+v[k]).join(" · ");
   if(q.length){
     const start=Math.min(...q.map(p=>Math.min(p[0],p[1]))),end=Math.max(...q.map(p=>p[0]))-start;
     plot($("scores"),q.map(p=>[p[0]-start,p[2],p[3]]),[0,0],[end,1],+v["accept_score"]);

@@ -74,7 +74,7 @@ class Run:
 
     def sentence(self) -> str:
         """The outcome in a line that one may repeat."""
-        queries = {c.query.stamp_ns for c in self.heard.closures}
+        queries = {c.query.stamp_ns for c in self.heard.closures if self.right(c) is not False}
         waited = f", {np.median(self.latencies_ms):.0f} ms after the image" if len(self.latencies_ms) else ""
         found = f"{len(queries)} times the camera came back to a place the node knew, and it said so{waited}"
         if self.truth is None:

@@ -122,12 +122,20 @@ def _chapter(evaluation: Evaluation, chapter: Chapter) -> str:
     parts = [
         f"<h2>{html.escape(dataset.name)}</h2>",
         f"<p>{counted}, among {len(dataset.references)} references. True matches: {html.escape(dataset.rule)}.</p>",
+        _one_size(evaluation, results),
         _details(chapter.figures),
         f'<div class="charts">{"".join(_charts(results))}{_matrix(evaluation, results[0])}{_trajectory(results)}</div>',
     ]
     shown = next((r for r in reversed(results) if r.method.scorer and r.method.features == "patchnetvlad"), results[-1])
     parts.append(_galleries(evaluation, shown))
     return "".join(parts)
+
+
+def _one_size(evaluation: Evaluation, results: Sequence[MethodResult]) -> str:
+    """A word where a model of one patch size makes several methods the same."""
+    multi = [r.method for r in results if r.method.sizes == "multi" and r.method.features == "patchnetvlad"]
+    alone = [m for m in multi if len(evaluation.completed(m.config(evaluation.config)).patch_sizes) == 1]
+    return "<p>The model has one patch size: Multi-* equals Single-*.</p>" if alone else ""
 
 
 def _details(figures: Sequence[Figures]) -> str:
