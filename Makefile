@@ -17,7 +17,7 @@ TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
-.PHONY: install shell demo slam-demo test bench docs lint clean
+.PHONY: install shell demo slam-demo fleet-demo test bench docs lint clean
 
 install: $(READY) $(MESSAGES)
 
@@ -50,6 +50,12 @@ slam-demo: $(READY)
 	@echo "slam-demo: a pose graph closed by the node, over ROS 2; some minutes"
 	@$(BIN)/python -c "import gtsam, evo" 2>/dev/null || $(BIN)/pip install --progress-bar off -q -e ".[slam]"
 	@$(BIN)/python -m examples.pose_graph $(ARGS)
+
+fleet-demo: $(READY)
+	@echo "fleet-demo: three robots and a Milvus Lite server, over ROS 2; about three minutes"
+	@$(BIN)/python -c "import pymilvus, milvus_lite, gtsam" 2>/dev/null || \
+	    $(BIN)/pip install --progress-bar off -q -e ".[fleet,slam]"
+	@$(BIN)/python -m examples.fleet $(ARGS)
 
 test: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)

@@ -70,7 +70,11 @@ class Process:
 
 
 def node_process(
-    environment: dict[str, str], parameters: dict[str, Any], assignments: Sequence[str], echo: IO[str] | None
+    environment: dict[str, str],
+    parameters: dict[str, Any],
+    assignments: Sequence[str],
+    echo: IO[str] | None,
+    namespace: str = "",
 ) -> Process:
     """The installed `place_recognizer` with ROS parameters, and more of them as `name:=value`.
 
@@ -82,6 +86,8 @@ def node_process(
         raise PnvError(f"no place_recognizer beside {sys.executable} or on the PATH; allowed: after `make install`")
     given = [f"{name}:={_yaml(value)}" for name, value in parameters.items()] + list(assignments)
     flags = [flag for assignment in given for flag in ("-p", assignment)]
+    if namespace:
+        flags += ["-r", f"__ns:={namespace}"]
     return Process("node", [executable, "--ros-args", *flags], environment, echo)
 
 

@@ -1,0 +1,1 @@
+"""make fleet-demo: robots that recognise each other's places."""
