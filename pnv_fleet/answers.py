@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.config import Config
-from pnv_core.decide.consistency import SequenceMemory, window_of
+from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
 from pnv_core.decide.gates import decided
 from pnv_core.decide.judge import Judge
 from pnv_core.types import LoopClosure, PlaceDescriptor, Query
@@ -45,7 +45,7 @@ class Answers:
         candidates = [(hit.place.ref, hit.similarity) for hit in known]
         references = [descriptors[hit.place.key] for hit in known]
         closures = self._judge.judged(query.ref, descriptor, query.predecessor, candidates, references, self.config)
-        self._sequence.remember(query.ref.camera, closures, window_of(self.config.consistency))
+        self._sequence.remember(query.ref.camera, closures, window_of(self.config.consistency + DOUBT))
         return [decided(closure, self.config, self._sequence) for closure in closures]
 
     def keep(self, rgb: NDArray[np.uint8]) -> bytes:
