@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from pnv_core.config import Config
 from pnv_core.errors import PnvError
 
 OK, NOTE, FAULT = "ok", "note", "FAULT"
@@ -22,6 +23,7 @@ _ROS_WHEELS = "pip install 'pnv_ros[ros]'"
 _LEAST_SHM_MB = 64.0  # what Docker gives by default; a few 1280x960 images fill it
 _LEAST_UDP_BYTES = 2_000_000  # one 1280x720 colour image is 2.8 MB; below, fragments of large images are lost
 _TIMEOUT_S = 60
+_PRECISIONS = {"FP32": "float32", "BF16": "bfloat16", "INT8": "int8"}  # by the library's names
 
 # Runs in a process of its own: a broken middleware may hang or crash, and the command line stays free of ROS.
 _MIDDLEWARE_PROBE = """
@@ -106,6 +108,17 @@ def _torch() -> Finding:
         return Finding("torch", FAULT, f"{torch.__version__} computes a convolution wrongly", "reinstall torch")
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else "no CUDA device, the CPU is used"
     return Finding("torch", OK, f"{torch.__version__}, {torch.get_num_threads()} threads, {gpu}")
+
+
+def _openvino() -> Finding:
+    try:
+        from pnv_core.networks.openvino_backend import fast_precisions, release
+    except (ImportError, OSError) as error:
+        advice = "pip install openvino, or set backend: torch"
+        return Finding("openvino", FAULT, str(error), advice)
+    fast = [_PRECISIONS[name] for name in fast_precisions() if name in _PRECISIONS]
+    used = Config().trunk_precision
+    return Finding("openvino", OK, f"{release()}; fast here: {', '.join(fast)}; the network computes in {used}")
 
 
 def _opencv() -> Finding:
@@ -261,5 +274,5 @@ def _installed() -> set[str]:
 
 
 CHECKS = (
-    _python, _torch, _opencv, _faiss, _model, _ros, _middleware, _shared_memory, _udp_buffers, _memory, _cache,
+    _python, _openvino, _torch, _opencv, _faiss, _model, _ros, _middleware, _shared_memory, _udp_buffers, _memory, _cache,
 )  # fmt: skip

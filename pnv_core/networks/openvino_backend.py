@@ -93,6 +93,11 @@ def _keep(path: Path, stamp: bytes, body: bytes) -> None:
         pass  # a home that cannot be written to costs time at the next start, nothing else
 
 
+def release() -> str:
+    """The library's version."""
+    return str(ov.__version__).partition("-")[0]
+
+
 def fast_precisions() -> list[str]:
     """What this processor multiplies natively, by the library's account: FP32, BF16, INT8, ..."""
     return list(ov.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
