@@ -274,5 +274,6 @@ def _installed() -> set[str]:
 
 
 CHECKS = (
-    _python, _openvino, _torch, _opencv, _faiss, _model, _ros, _middleware, _shared_memory, _udp_buffers, _memory, _cache,
+    _python, _openvino, _torch, _opencv, _faiss, _model, _ros, _middleware, _shared_memory, _udp_buffers, _memory,
+    _cache,
 )  # fmt: skip
