@@ -73,10 +73,10 @@ def setting(default: Any, doc: str, *, kind: type | None = None, **limits: Any) 
 
 
 def settings_of(config_class: type) -> dict[str, Setting]:
-    """Every setting a Config class declares, in order, by name."""
+    """Every setting a Config class declares, in order, by name; those it inherits first."""
     fields = {f.name: f for f in dataclasses.fields(config_class) if "setting" in f.metadata}
     found, section = {}, ""
-    for name, value in vars(config_class).items():
+    for name, value in (item for kind in reversed(config_class.__mro__) for item in vars(kind).items()):
         if isinstance(value, Section):
             section = str(value)
         elif name in fields:

@@ -1,6 +1,6 @@
-"""config/*.yaml and docs/ros_interface.md, written from the declarations.
+"""config/*.yaml, docs/ros_interface.md and docs/bridges.md, written from the declarations.
 
-python -m pnv_ros.reference    rewrites both in the current checkout
+python -m pnv_ros.reference    rewrites them in the current checkout
 """
 
 from pathlib import Path
@@ -9,8 +9,9 @@ from typing import Any
 from msg_adapters.images import ENCODINGS
 from msg_adapters.loop_closures import CANDIDATE_FIELDS, COLUMNS
 from pnv_core.config import PRESETS
-from pnv_core.settings import Setting
+from pnv_core.settings import Setting, settings_of
 from pnv_core.types import Reason
+from pnv_ros.bridges.config import BRIDGE_SETTINGS
 from pnv_ros.inputs import OVERRIDABLE, image_qos, qos_in_words
 from pnv_ros.markers import MARKERS_QOS
 from pnv_ros.outputs import CLOSURES_QOS, PICTURE_QOS, TABLE_QOS
@@ -78,10 +79,20 @@ def interface_markdown() -> str:
     )  # fmt: skip
 
 
+def bridges_markdown() -> str:
+    """docs/bridges.md."""
+    parts = ["# Parameters of the bridges\n\nWritten by `python -m pnv_ros.reference`; see [backends](backends.md).\n"]
+    for name, kind in BRIDGE_SETTINGS.items():
+        rows = [(f"`{s.name}`", f"`{_yaml(s.default)}`", s.doc, s.allowed()) for s in settings_of(kind).values()]
+        parts.append(f"\n## {name}\n\n{_table(('parameter', 'default', 'meaning', 'allowed'), rows)}\n")
+    return "".join(parts)
+
+
 def files(root: Path) -> dict[Path, str]:
     """What the reference files of a checkout must contain."""
     return {root / "config" / f"{preset}.yaml": parameters_yaml(preset) for preset in PRESETS} | {
-        root / "docs" / "ros_interface.md": interface_markdown()
+        root / "docs" / "ros_interface.md": interface_markdown(),
+        root / "docs" / "bridges.md": bridges_markdown(),
     }
 
 

@@ -89,3 +89,11 @@ class SwarmSlamConfig(BridgeConfig):
 
     tolerance_s: float = setting(0.5, "furthest in time a node may be from an image", unit="s", low=0.0, high=60.0)
     wait_s: float = setting(10.0, "a closure waits until a node is so much newer than it", unit="s", low=0.0, high=1e4)
+
+
+BRIDGE_SETTINGS: dict[str, type[BridgeConfig]] = {
+    "tf_bridge": TfConfig,
+    "rtabmap_bridge": RtabmapConfig,
+    "hydra_bridge": HydraConfig,
+    "swarm_slam_bridge": SwarmSlamConfig,
+}

@@ -10,6 +10,7 @@ import yaml
 from pnv_core.config import PRESETS
 from pnv_core.settings import settings_of
 from pnv_ros import reference
+from pnv_ros.bridges.config import BRIDGE_SETTINGS
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.parameters import DECLARED, NODE, RECOGNISER, descriptor_of, preset_defaults
 from test.ros.processes import ROOT
@@ -120,20 +121,25 @@ def test_launch_files_name_only_what_exists(path, monkeypatch):
     assert all(kwargs["description"] for kwargs in declared.values())
     assert {c.args[0] for c in log if c.name == "LaunchConfiguration"} == set(declared)
     nodes = [c for c in log if c.name == "Node"]
-    assert len(nodes) == 1
-    assert (nodes[0].kwargs["package"], nodes[0].kwargs["executable"]) == ("pnv_ros", "place_recognizer")
-    given = [name for part in nodes[0].kwargs["parameters"] if isinstance(part, dict) for name in part]
-    assert set(given) - {"use_sim_time"} <= set(DECLARED)
-    for name in set(declared) & set(DECLARED):
-        if "default_value" in declared[name]:
-            DECLARED[name].check(yaml.safe_load(declared[name]["default_value"] or "''"))
+    bridges = {name: settings_of(kind) for name, kind in BRIDGE_SETTINGS.items()}
+    executables = [node.kwargs["executable"] for node in nodes]
+    assert executables in (["place_recognizer"], ["place_recognizer", "tf_bridge"], *([name] for name in bridges))
+    for node in nodes:
+        assert node.kwargs["package"] == "pnv_ros"
+        settings = bridges.get(node.kwargs["executable"], DECLARED)
+        given = {name for part in node.kwargs["parameters"] if isinstance(part, dict) for name in part}
+        assert given - {"use_sim_time"} <= set(settings)
+        for name in given & set(declared) & set(settings):
+            if "default_value" in declared[name]:
+                settings[name].check(yaml.safe_load(declared[name]["default_value"] or "''"))
     for files in (kwargs["default_value"] for name, kwargs in declared.items() if name == "params_file"):
         _, folder, argument, suffix = files
         assert argument.args == ("preset",)
         assert all((ROOT / (folder.strip("/")) / (preset + suffix)).is_file() for preset in PRESETS)
 
 
-def test_there_is_a_launch_file_for_a_bag_and_one_for_two_cameras():
+def test_there_is_a_launch_file_for_a_bag_for_two_cameras_and_for_every_bridge():
     assert [p.name for p in LAUNCH_FILES] == [
-        "bag.launch.py", "place_recognizer.launch.py", "two_cameras.launch.py",
+        "bag.launch.py", "hydra_bridge.launch.py", "place_recognizer.launch.py", "rtabmap_bridge.launch.py",
+        "swarm_slam_bridge.launch.py", "tf_bridge.launch.py", "two_cameras.launch.py",
     ]  # fmt: skip
