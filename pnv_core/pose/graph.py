@@ -67,7 +67,7 @@ class PoseGraph:
         self._kernel = _kernel(gtsam, kernel)
         self._after_break = gtsam.noiseModel.Diagonal.Sigmas(np.array(_AFTER_BREAK))
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.02)
+        parameters.setRelinearizeThreshold(0.1)
         parameters.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(parameters)
         self._factors, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
