@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from collections.abc import Sequence
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
@@ -26,6 +27,7 @@ class Diagnostics:
         self._looks: deque[tuple[float, Counts, int]] = deque()  # when, counts, odometry samples refused
         self._seen: dict[str, tuple[int, float]] = {}
         self._warned: dict[str, float] = {}
+        self._lossy: set[str] = set()  # topics whose losses were said
 
     def close(self) -> None:
         self._node.destroy_publisher(self._publisher)
@@ -52,6 +54,7 @@ class Diagnostics:
         else:
             self._log_silence(now, silent, inputs)
 
+        losses = self._losses(settings.node.image_topics, inputs)
         fleet = self._recognition.fleet.status() if self._recognition.fleet is not None else None
         level = DiagnosticStatus.WARN
         if self._statistics.autosave_failure:
@@ -75,9 +78,19 @@ class Diagnostics:
             text = fleet.sentence()
         elif missing := self._recognition.without_picture():
             text = missing
+        elif losses:
+            text = losses[0]
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
-        self.publish(level, text, self._values(rates, settings) | (fleet.values() if fleet is not None else {}))
+        self.publish(level, text, self._values(rates, settings, inputs) | (fleet.values() if fleet is not None else {}))
+
+    def _losses(self, topics: Sequence[str], inputs: ImageInputs) -> list[str]:
+        """What the middleware loses of late; each topic's is logged once."""
+        said = {topic: sentence for topic in topics if (sentence := inputs.losses.sentence(topic))}
+        for topic in set(said) - self._lossy:
+            self._lossy.add(topic)
+            self._node.get_logger().warning(f"{said[topic]} (said once)")
+        return list(said.values())
 
     def _why(self, why: Drop, camera: str, inputs: ImageInputs, companions: Companions) -> str:
         """What keeps every frame of a camera from being used, in words."""
@@ -96,7 +109,8 @@ class Diagnostics:
         keyframes = len(self._recognition.recognizer.database)
         return f"{rates[1]:.1f} of {rates[0]:.1f} frames/s, {keyframes} keyframes, {best}"
 
-    def _values(self, rates: tuple[float, float], settings: Settings) -> dict[str, str]:
+    def _values(self, rates: tuple[float, float], settings: Settings, inputs: ImageInputs) -> dict[str, str]:
+        losses = {topic: inputs.losses.share(topic) for topic in settings.node.image_topics}
         counts = self._statistics.counts()
         score = max(self._statistics.best_scores, default=None)
         stats = self._recognition.recognizer.database.stats()
@@ -106,6 +120,7 @@ class Diagnostics:
             "frames processed [1/s]": f"{rates[1]:.2f}",
             "frames in": str(counts.received.total()),
             "frames processed": str(counts.processed.total()),
+            **{f"lost on the way, {t} [%]": f"{100 * share:.0f}" for t, share in losses.items()},
             **{f"dropped: {why}": str(counts.of(why)) for why in Drop},
             "keyframes": str(stats.keyframes),
             "keyframes evicted": str(stats.evicted),

@@ -11,6 +11,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from pnv_core.timing import StageTimer
+from pnv_ros.losses import TransportLosses
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.slot import NewestFrames, WaitingFrame
 from pnv_ros.stamps import StampRule, StampVerdict, in_seconds
@@ -61,6 +62,7 @@ class ImageInputs:
         self._node, self._config, self._frames = node, config, frames
         self._statistics, self._stamps, self._timer = statistics, stamps, timer
         self.paused = False
+        self.losses = TransportLosses()
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
         self._mismatches: dict[str, str] = {}  # topic: policy
@@ -150,6 +152,7 @@ class ImageInputs:
                     topic, Drop.STAMP_REPEATED if ruling.verdict is StampVerdict.REPEATED else Drop.STAMP_BACK
                 )
                 return
+            self.losses.arrived(topic, stamp_ns)
             if self._frames.put(WaitingFrame(topic, stamp_ns, ruling.session, serialized, message_type)):
                 self._statistics.drop(topic, Drop.BUSY)
 
