@@ -18,9 +18,8 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from scipy.spatial.transform import Rotation
 
-from examples.pose_graph.back_end import BackEndNode, Recording
+from examples.pose_graph.back_end import BackEndNode, Recording, graph_of
 from examples.pose_graph.drift import drifted
-from examples.pose_graph.graph import PoseGraph
 from examples.pose_graph.report import Result, plot, print_table, trial, write_tables
 from examples.pose_graph.sequences import Array, Walk, walks
 from examples.processes import isolated_environment, node_process, publisher_process
@@ -99,7 +98,7 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[Recording
     """Play a walk through node and back end: what arrived and the corrected poses (n, 4, 4)."""
     environment = isolated_environment()
     rclpy.init(args=[])
-    back_end = BackEndNode(PoseGraph(walk.noise))
+    back_end = BackEndNode(graph_of(walk.noise))
     parameters = {"image_topics": [IMAGE_TOPIC], "odometry_topic": ODOMETRY_TOPIC, **walk.parameters}
     if walk.intrinsics:
         parameters["camera_info_topics"] = [INFO_TOPIC]
@@ -124,7 +123,7 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[Recording
                         ended = time.monotonic()
                 if publisher.return_code:
                     raise PnvError("\n".join(line for line in publisher.lines if not line.startswith("{")))
-            back_end.correct()
+            back_end.correct(everything=True)
             if len(back_end.back_end.stamps) != len(walk.stamps_ns):
                 count = len(back_end.back_end.stamps)
                 raise PnvError(f"{walk.name}: {count} of {len(walk.stamps_ns)} odometry messages arrived")

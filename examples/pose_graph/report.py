@@ -11,9 +11,8 @@ from evo.core.trajectory import PosePath3D
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from examples.pose_graph.back_end import BackEnd, Recording
+from examples.pose_graph.back_end import Recording, RecordingBackEnd, graph_of
 from examples.pose_graph.drift import drifted
-from examples.pose_graph.graph import PoseGraph
 from examples.pose_graph.sequences import Walk
 from pnv_core.types import ImageRef, LoopClosure
 
@@ -81,11 +80,11 @@ def _trials(walk: Walk, recording: Recording, share: float, count: int) -> Trial
 
 def trial(walk: Walk, odometry: Array, recording: Recording, robust: bool) -> Array:
     """The corrected poses (n, 4, 4) that the back end gives for an odometry and a recording."""
-    back_end = BackEnd(PoseGraph(walk.noise, robust))
+    back_end = RecordingBackEnd(graph_of(walk.noise, robust))
     for stamp, pose in zip(walk.stamps_ns, odometry, strict=True):
         back_end.add_odometry(stamp, pose)
     back_end.play(recording)
-    back_end.update()
+    back_end.update(everything=True)
     return back_end.graph.poses
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from examples.pose_graph.drift import Drift
-from examples.pose_graph.graph import Noise
+from pnv_core.pose.graph import Noise
 from pnv_lab.worlds import Camera, Pose, loop_sequence
 
 Array = NDArray[np.float64]
