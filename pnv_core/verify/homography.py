@@ -177,7 +177,7 @@ def _iterations(outliers: float, most: int) -> int:
     return most if each >= 0 or -wanted >= most * -each else round(wanted / each)
 
 
-@functools.lru_cache(maxsize=1)
+@functools.lru_cache(maxsize=8)
 def _draws(power: int) -> NDArray[np.uint32]:
     """The first 2 ** power of OpenCV's random numbers."""
     found, state = [], 0xFFFFFFFFFFFFFFFF  # its seed
@@ -187,8 +187,8 @@ def _draws(power: int) -> NDArray[np.uint32]:
     return np.array(found, np.uint32)
 
 
-@functools.lru_cache(maxsize=32)
-def _samples(matches: int, block: int) -> tuple[NDArray[np.intp], int]:
+@functools.lru_cache(maxsize=256)  # 50 kB each; neighbouring frames have about as many matches
+def _samples(matches: int, block: int) -> tuple[NDArray[np.int16], int]:
     """(n, 4) numbers of matches as OpenCV draws them, four different ones at a time, and how many draws that took.
 
     Block 0 has _FIRST samples, every later one _BLOCK.
@@ -204,24 +204,29 @@ def _samples(matches: int, block: int) -> tuple[NDArray[np.intp], int]:
             clean &= quads[:, j] != quads[:, k]
         rows, at = _walk(drawn, quads, clean.tobytes(), count)
         if len(rows) == count:
-            return np.array(rows, np.intp), start + at
+            return rows, start + at
         enough += 1
 
 
-def _walk(drawn: NDArray[np.int16], quads: NDArray[np.int16], clean: bytes, count: int) -> tuple[list, int]:
+def _walk(
+    drawn: NDArray[np.int16], quads: NDArray[np.int16], clean: bytes, count: int
+) -> tuple[NDArray[np.int16], int]:
     """Samples one after another: most are four draws, those that repeat a number take more."""
-    rows: list = []
-    at = 0
-    while len(rows) < count and at < len(quads) - 64:
+    places: list[int] = []
+    longer: dict[int, list[int]] = {}
+    at, last = 0, len(quads) - 64
+    while len(places) < count and at < last:
+        places.append(at)
         if clean[at]:
-            rows.append(quads[at])
             at += 4
             continue
         sample: list[int] = []
         while len(sample) < 4 and at < len(drawn):
             if drawn[at] not in sample:
-                sample.append(drawn[at])
+                sample.append(int(drawn[at]))
             at += 1
-        if len(sample) == 4:
-            rows.append(sample)
+        longer[len(places) - 1] = sample
+    rows = quads[places]
+    for number, sample in longer.items():
+        rows[number] = sample
     return rows, at
