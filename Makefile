@@ -3,6 +3,8 @@
 # make demo      a sequence through the real node; IMAGES=DIR, VIDEO=FILE or BAG=DIR take your own
 # make slam-demo a pose graph closed by the node
 # make test      every test
+# make faults    the fault tests at full counts, and their table; minutes
+# make soak      the node for an hour (MINUTES=60): memory, latency, threads and file handles as out/soak.png
 # make bench     the benchmarks
 # make docs      the documentation as a site in out/site, every link checked
 # make lint      ruff and mypy
@@ -17,7 +19,7 @@ TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
-.PHONY: install shell demo slam-demo fleet-demo test bench docs lint clean
+.PHONY: install shell demo slam-demo fleet-demo test faults soak bench docs lint clean
 
 install: $(READY) $(MESSAGES)
 
@@ -59,6 +61,17 @@ fleet-demo: $(READY)
 
 test: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
+
+faults: $(READY)
+	@mkdir -p out && rm -f out/faults.jsonl
+	@PNV_FULL_TESTS=1 PNV_ROS_FAULTS=full PNV_FAULT_TABLE=$(CURDIR)/out/faults.jsonl OMP_NUM_THREADS=1 \
+	    $(BIN)/python -m pytest -p no:randomly test/maps test/database/test_failing_disk.py test/decide/test_odometry.py \
+	    test/adapters/test_camera_info.py test/core/test_files.py test/ros/test_faults.py test/ros/test_hostile_inputs.py $(ARGS)
+	@$(BIN)/python -m test.tally out/faults.jsonl
+
+soak: $(READY)
+	@mkdir -p out
+	@$(BIN)/python -m test.ros.soak --minutes $(or $(MINUTES),60) --output out/soak.png
 
 bench: $(READY)
 	@$(BIN)/python -m benchmarks.run

@@ -5,9 +5,10 @@ import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from pnv_cli.common import CommandParser, hint
-from pnv_core.errors import PnvError
+from pnv_core.errors import ConfigError, PnvError, one_line, shown
 
 COMMANDS = {
     "run": "loop closures of a folder of images, a video or a bag, with a report",
@@ -49,6 +50,17 @@ def command_parser(name: str) -> CommandParser:
     return parser
 
 
+def _require_usable(args: argparse.Namespace) -> None:
+    """Refuse numbers that are not finite or beyond 64 bits, and names that no file can have, whatever the flag."""
+    for name, given in vars(args).items():
+        for value in given if isinstance(given, list) else [given]:
+            flag = "--" + name.removeprefix("setting_").replace("_", "-")
+            if isinstance(value, int | float) and not abs(value) < 2**63:
+                raise ConfigError(f"{flag} {shown(value)}; allowed: a finite number of 64 bits")
+            if isinstance(value, str | Path) and "\0" in str(value):
+                raise ConfigError(f"{flag} {shown(str(value))}; allowed: text without NUL")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a subcommand. 0 done, 2 unusable input with one line on stderr, 130 interrupted."""
     given = list(sys.argv[1:] if argv is None else argv)
@@ -68,12 +80,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_command(given[1:])
     args.command_line = shlex.join(["pnv", *given])  # reports say how to repeat them
     try:
+        _require_usable(args)
         return int(args.run(args))
     except PnvError as error:
         print(f"pnv: {error}", file=sys.stderr)
         return 2
     except OSError as error:  # a path that cannot be read or written: the system's words name it
-        print(f"pnv: {error.strerror or error}: {error.filename or ''}", file=sys.stderr)
+        print(one_line(f"pnv: {error.strerror or error}: {error.filename or ''}"), file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("pnv: interrupted", file=sys.stderr)

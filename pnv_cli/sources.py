@@ -103,9 +103,15 @@ def _read_timestamps(path: str, names: list[str]) -> list[int]:
     for line, row in enumerate(rows(Path(path), ("frame", "timestamp")), start=2):
         try:
             seconds, _, fraction = row["timestamp"].strip().partition(".")
-            stamps[row["frame"].strip()] = int(seconds) * 10**9 + int((fraction + "0" * 9)[:9])
+            if len(seconds) > 11:  # 2**63 ns are 9,223,372,036 s
+                raise ValueError
+            stamp = int(seconds) * 10**9 + int((fraction + "0" * 9)[:9])
+            if not -(2**63) <= stamp < 2**63:
+                raise ValueError
+            stamps[row["frame"].strip()] = stamp
         except (ValueError, AttributeError):
-            raise PnvError(f"{path} line {line}: timestamp {row['timestamp']!r}; allowed: seconds") from None
+            allowed = "seconds, below 9223372036"
+            raise PnvError(f"{path} line {line}: timestamp {row['timestamp']!r}; allowed: {allowed}") from None
     by_stem = {Path(name).stem: stamp for name, stamp in stamps.items()}
     found = [stamps.get(name, by_stem.get(Path(name).stem)) for name in names]
     if None in found:

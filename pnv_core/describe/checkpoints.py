@@ -3,7 +3,9 @@
 K clusters, P output dimensions. Both are read from the shapes.
 """
 
+import os
 import pickle
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,7 @@ def load_checkpoint(path: Path | str) -> Model:
     import torch  # slow to import; what was read is kept converted (describer.read_model)
 
     source = str(path)
+    _require_plain_archive(source)
     try:
         content = torch.load(source, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -30,12 +33,29 @@ def load_checkpoint(path: Path | str) -> Model:
         raise ModelError(
             f"{source}: is no plain tensor file (its pickle is damaged or holds other objects); refused"
         ) from None
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError) as error:
+    except Exception as error:  # torch raises whatever its readers meet in a damaged file
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise ModelError(f"{source}: not a readable torch checkpoint, or truncated ({reason[:160]})") from None
     return build_model(
         ModelInfo(trunk="vgg16", provenance=f"checkpoint {Path(source).name}"), _renamed(content, source), source
     )
+
+
+def _require_plain_archive(source: str) -> None:
+    """Refuse an archive that unpacks to more than it is, before anything is unpacked: torch compresses nothing."""
+    try:
+        if not zipfile.is_zipfile(source):
+            return
+        with zipfile.ZipFile(source) as archive:
+            unpacked = sum(item.file_size for item in archive.infolist())
+            packed = any(item.compress_type != zipfile.ZIP_STORED for item in archive.infolist())
+    except FileNotFoundError:
+        return  # said by who opens it
+    except Exception as error:
+        raise ModelError(f"{source}: not a readable torch checkpoint ({error})") from None
+    size = os.path.getsize(source)
+    if packed or unpacked > size:
+        raise ModelError(f"{source}: {size} bytes that unpack to {unpacked}; allowed: a checkpoint as torch writes it")
 
 
 def _renamed(content: Any, source: str) -> Tensors:

@@ -4,6 +4,7 @@ Facts of the published files: Patch-NetVLAD repository, download_models.py, and 
 """
 
 import hashlib
+import http.client
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ DEFAULT_MODEL = Path(__file__).parents[1] / "models" / "default.safetensors"
 _BASE_URL = "https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/"
 _CHUNK = 1 << 20
 _TIMEOUT_S = 30
+_MOST_BYTES = 2_500_000_000  # the largest published file takes 0.6 GB, in float64 1.2 GB
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,9 @@ def file_sha256(path: Path) -> str:
 def fetch(name: str, progress: Callable[[int, int], None] = lambda done, total: None) -> Path:
     """Download a published checkpoint into the cache folder: resumed where it stopped, checked, renamed.
 
-    The publisher gives no hashes: the sha256 of the first complete download is recorded beside the file, and later
-    ones must equal it. `progress(done, total)` counts bytes; total is 0 where the server does not say.
+    The publisher gives no hashes: a download must load as the model of its name before it is put in place; the sha256
+    of the first is recorded beside the file, and later ones must equal it. `progress(done, total)` counts bytes; total
+    is 0 where the server does not say.
     Raises ModelError for an unknown name, an unreachable network, or a file that differs.
     """
     if name not in PUBLISHED:
@@ -97,6 +100,11 @@ def fetch(name: str, progress: Callable[[int, int], None] = lambda done, total: 
     if recorded and recorded != digest:
         part.unlink()
         raise ModelError(f"{name}: sha256 {digest} differs from the recorded {recorded}; the download was discarded")
+    try:
+        _require_model(item, part)
+    except ModelError:
+        part.unlink()
+        raise
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, item.path)
@@ -105,6 +113,24 @@ def fetch(name: str, progress: Callable[[int, int], None] = lambda done, total: 
         with atomic_write(_record(item)) as out:
             out.write(json.dumps(record, indent=1).encode())
     return item.path
+
+
+def _require_model(item: Published, part: Path) -> None:
+    """Raises ModelError unless the file is the checkpoint that its name promises."""
+    from pnv_core.describe.checkpoints import load_checkpoint
+
+    try:
+        model = load_checkpoint(part)
+    except ModelError as error:
+        with part.open("rb") as file:
+            begins = file.read(40)
+        raise ModelError(
+            f"{item.name}: what {item.url} sent is no checkpoint ({part.stat().st_size} bytes, {begins!r}), and was "
+            f"discarded: {error}"
+        ) from None
+    found = model.clusters, model.global_dim
+    if found != (item.clusters, item.dim):
+        raise ModelError(f"{item.name}: K, D = {found} arrived; allowed: {item.clusters}, {item.dim}; it was discarded")
 
 
 def recorded_sha256(item: Published) -> str | None:
@@ -128,7 +154,9 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
             resumed = answer.status == 206
-            length = int(answer.headers.get("Content-Length") or 0)
+            length = max(0, int(answer.headers.get("Content-Length") or 0))
+            if length > _MOST_BYTES:
+                raise ModelError(f"{url}: {length} bytes are offered; allowed: {_MOST_BYTES}")
             total = (have if resumed else 0) + length if length else 0
             if total:
                 free = shutil.disk_usage(part.parent).free
@@ -139,6 +167,8 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
                 while chunk := answer.read(_CHUNK):
                     out.write(chunk)
                     done += len(chunk)
+                    if done > _MOST_BYTES:
+                        raise ModelError(f"{url}: more than {_MOST_BYTES} bytes came; delete {part} to begin anew")
                     progress(done, total)
             return total
     except urllib.error.HTTPError as error:
@@ -151,8 +181,10 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
                 ) from None
             return have
         raise ModelError(f"{url}: the server answered {error.code} {error.reason}") from None
-    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
-        reason = getattr(error, "reason", error)
+    except ModelError:
+        raise
+    except (urllib.error.URLError, TimeoutError, ConnectionError, http.client.HTTPException, ValueError) as error:
+        reason = getattr(error, "reason", None) or f"{type(error).__name__}: {error}"
         raise ModelError(
             f"{url}: cannot be reached ({reason}); check the network, or copy the file to {part.parent} by hand"
         ) from None

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from safetensors import SafetensorError, safe_open
@@ -22,6 +23,8 @@ from pnv_core.errors import ModelError
 from pnv_core.files import atomic_write
 
 FORMAT = "pnv-model-1"
+_MOST_TEXT = 100_000  # characters of a text in the metadata
+_MOST_SIZES = 16
 OPTIONAL = ("patch_projection", "pooled_projection")
 
 Tensors = dict[str, NDArray[np.float32]]
@@ -104,7 +107,12 @@ def build_model(info: ModelInfo, tensors: Mapping[str, NDArray], source: str) ->
         raise ModelError(
             f"{source}: holds the parts {sorted(parts)}; allowed: trunk, {', '.join(sorted((*required, *OPTIONAL)))}"
         )
-    trunk = model.trunk
+    try:
+        trunk = model.trunk
+    except (TypeError, ValueError, OverflowError, AttributeError) as error:
+        if isinstance(error, ModelError):
+            raise
+        raise ModelError(f"{source}: trunk_options {info.trunk_options} do not make a {info.trunk} ({error})") from None
     centroids = model.tensors.get("netvlad.centroids")
     if centroids is None or centroids.ndim != 2 or centroids.shape[1] != trunk.channels:
         shape = None if centroids is None else tuple(centroids.shape)
@@ -161,24 +169,49 @@ def load_model(path: Path | str) -> Model:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except FileNotFoundError:
         raise ModelError(f"{source}: no such model file") from None
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ModelError(f"{source}: not a readable safetensors file ({error})") from None
     if metadata.get("format") != FORMAT:
         raise ModelError(f"{source}: format {metadata.get('format')!r}; allowed: {FORMAT!r}")
-    try:
-        info = ModelInfo(
-            trunk=metadata["trunk"],
-            trunk_options=json.loads(metadata["trunk_options"]),
-            image_width=int(metadata["image_width"]),
-            image_height=int(metadata["image_height"]),
-            patch_sizes=tuple(int(p) for p in json.loads(metadata["patch_sizes"])),
-            patch_weights=tuple(float(w) for w in json.loads(metadata["patch_weights"])),
-            provenance=metadata["provenance"],
-            calibration=json.loads(metadata.get("calibration", "null")),
-        )
-    except (KeyError, ValueError, TypeError) as error:
-        raise ModelError(f"{source}: metadata is incomplete or malformed ({error})") from None
+    info = _info(metadata, source)
     model = build_model(info, tensors, source)
     if model.fingerprint() != metadata.get("fingerprint"):
         raise ModelError(f"{source}: the tensors do not match their fingerprint; the file was altered or damaged")
     return model
+
+
+_Side = Annotated[int, msgspec.Meta(ge=16, le=8192)]
+_Size = Annotated[int, msgspec.Meta(ge=1, le=64)]
+_Weight = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
+_Option = bool | int | float | str | None
+
+
+def _info(metadata: dict[str, str], source: str) -> ModelInfo:
+    """What the metadata says, each part of its type and within its bounds. Raises ModelError."""
+
+    def part(name: str, kind: Any) -> Any:
+        try:
+            return msgspec.json.decode(metadata[name].encode("utf-8", "replace"), type=kind)
+        except KeyError:
+            raise ModelError(f"{source}: its metadata lacks {name}") from None
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise ModelError(f"{source}: {name} in its metadata is malformed ({error})") from None
+
+    for name in ("trunk", "provenance"):
+        if len(metadata.get(name, "")) > _MOST_TEXT:
+            raise ModelError(f"{source}: {name} in its metadata has {len(metadata[name])} characters")
+    sizes = part("patch_sizes", tuple[_Size, ...])
+    weights = part("patch_weights", tuple[_Weight, ...])
+    if not sizes or len(sizes) != len(weights) or len(sizes) > _MOST_SIZES:
+        raise ModelError(f"{source}: {len(sizes)} patch sizes and {len(weights)} weights; allowed: as many, 1 to 16")
+    calibration = part("calibration", dict[str, Any] | None) if "calibration" in metadata else None
+    return ModelInfo(
+        trunk=metadata.get("trunk", ""),
+        trunk_options=part("trunk_options", dict[str, _Option]),
+        image_width=part("image_width", _Side),
+        image_height=part("image_height", _Side),
+        patch_sizes=sizes,
+        patch_weights=weights,
+        provenance=metadata.get("provenance", ""),
+        calibration=calibration,
+    )

@@ -3,12 +3,20 @@
 import hashlib
 import http.server
 import pickle
+import shutil
+import socket
+import tempfile
 import threading
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from pnv_core.describe import download as published
 from pnv_core.describe.checkpoints import load_checkpoint
@@ -17,6 +25,7 @@ from pnv_core.describe.model_files import load_model, save_model
 from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.errors import ModelError
 from test.core.small import HEIGHT, WIDTH, small_model
+from test.tally import count, tally
 
 
 def official(clusters=3, dim=5, dtype=torch.float64, prefix=""):
@@ -186,8 +195,81 @@ def server(monkeypatch, tmp_path):
     threading.Thread(target=server.serve_forever, daemon=True).start()
     monkeypatch.setattr(published, "_BASE_URL", f"http://127.0.0.1:{server.server_port}/")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(published, "_require_model", lambda item, part: None)  # these tests are of the transfer
     yield server
     server.shutdown()
+
+
+_ANSWERS = {
+    "a login page": b"HTTP/1.1 200 OK\r\n\r\n<html>please log in</html>",
+    "nothing": b"HTTP/1.1 200 OK\r\nContent-Length: 0\r\n\r\n",
+    "a body cut": b"HTTP/1.1 200 OK\r\nContent-Length: 1000\r\n\r\nabc",
+    "a body cut, no length": b"HTTP/1.1 200 OK\r\n\r\nPK\x03\x04",
+    "no HTTP": b"hello\r\n\r\n",
+    "hardly HTTP": b"\x00\xff\r\n",
+    "an odd length": b"HTTP/1.1 200 OK\r\nContent-Length: many\r\n\r\nabc",
+    "a length without end": b"HTTP/1.1 200 OK\r\nContent-Length: 99999999999999\r\n\r\nabc",
+    "a chunk cut": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\nff\r\nabc",
+    "a pickle": b"HTTP/1.1 200 OK\r\n\r\n" + pickle.dumps({"num_pcs": 128}),
+}
+
+
+@pytest.mark.parametrize("kind", _ANSWERS)
+def test_an_answer_that_is_no_model_is_refused_in_one_line_and_not_remembered(kind, monkeypatch, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer():
+            connection, _ = listening.accept()
+            with connection:
+                connection.recv(4096)
+                connection.sendall(_ANSWERS[kind])
+
+        threading.Thread(target=answer, daemon=True).start()
+        monkeypatch.setattr(published, "_BASE_URL", f"http://127.0.0.1:{listening.getsockname()[1]}/")
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        with pytest.raises(ModelError) as refused:
+            published.fetch("mapillary_WPCA128")
+    assert "\n" not in str(refused.value)
+    item = published.PUBLISHED["mapillary_WPCA128"]
+    assert not item.path.exists()
+    assert published.recorded_sha256(item) is None
+    tally("9 answers of a server that are no model", 1, 1)
+
+
+def test_an_archive_that_unpacks_to_more_than_it_is_is_refused_before(tmp_path):
+    with zipfile.ZipFile(tmp_path / "bomb.pth", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data.pkl", bytes(50_000_000))
+    with pytest.raises(ModelError, match="bytes that unpack to 50000000"):
+        load_checkpoint(tmp_path / "bomb.pth")
+
+
+METADATA = st.one_of(
+    st.text(max_size=30),
+    st.sampled_from(["null", "[]", "{}", "Infinity", "[Infinity]", "NaN", "[" * 5000, "x" * 10**6, "-1", "1e999",
+                     "[0.5]", '{"no_such": 1}', '{"stages": []}', '{"a": [1]}', "[" + "9" * 5000 + "]", "16"]),
+)  # fmt: skip
+
+
+NAMES = ("trunk", "trunk_options", "image_width", "image_height", "patch_sizes", "patch_weights", "provenance",
+         "calibration", "format", "fingerprint")  # fmt: skip
+
+
+@given(st.dictionaries(st.sampled_from(NAMES), METADATA, min_size=1, max_size=3))
+@settings(max_examples=count(100, 5000), deadline=None, database=None)
+def test_metadata_of_a_model_that_says_other_things_is_refused_in_one_line(changes):
+    folder = Path(tempfile.mkdtemp())
+    save_model(small_model(), folder / "m.safetensors")
+    with safe_open(folder / "m.safetensors", framework="np") as file:
+        metadata = file.metadata() | changes
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    save_file(tensors, folder / "m.safetensors", metadata)
+    try:
+        load_model(folder / "m.safetensors")
+    except ModelError as error:
+        assert "\n" not in str(error)
+        assert len(str(error)) <= 1000
+    finally:
+        shutil.rmtree(folder)
 
 
 def test_a_download_is_placed_whole_and_its_hash_recorded(server, tmp_path):
