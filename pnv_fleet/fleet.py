@@ -225,17 +225,19 @@ class Fleet:
                 self._robot, session, ref.camera, ref.id, ref.stamp_ns, seen.texture, seen.global_vector,
                 encode_view(kept), position,
             )  # fmt: skip
+            with self._changed:
+                self._pending.add(shared.key)  # before `send` can see it
             try:
                 self._outbox.add(shared, query.predecessor)
                 self._well("outbox")
             except FleetError as error:
                 self._tally(lost=1)
                 self._trouble("outbox", str(error))
+                with self._changed:
+                    self._pending.discard(shared.key)
                 shared = None
         asked = Query(ref, seen, query.predecessor)
         with self._changed:
-            if shared is not None:
-                self._pending.add(shared.key)
             self._fresh.append(
                 _Asked(of_robot(asked, self._robot, session), shared, self._where(ref.stamp_ns, oldest_ns), offered)
             )
@@ -335,6 +337,10 @@ class Fleet:
         """Those to send, once the fleet was asked what it was not asked in time."""
         late = [w for w in batch if not w.asked]
         for w in late:
+            with self._changed:
+                pending = w.place.key in self._pending
+            if pending or not self._outbox.unanswered(w.place.key):  # `ask` marks it before it lets go of it
+                continue
             place = w.place
             query = Query(place.ref, descriptor_of(place, self._like), w.predecessor)
             asked = _Asked(query, place, self._where(place.stamp_ns, place.session), -math.inf)
@@ -342,7 +348,9 @@ class Fleet:
                 return []
         if not late:
             return batch
-        now = {w.number: w for w in self._outbox.oldest(len(batch), 2 * _BATCH_BYTES, self._pending)}
+        with self._changed:
+            pending_keys = set(self._pending)
+        now = {w.number: w for w in self._outbox.oldest(len(batch), 2 * _BATCH_BYTES, pending_keys)}
         return [now[w.number] for w in batch if w.number in now and now[w.number].asked]
 
     def _repay(self) -> None:

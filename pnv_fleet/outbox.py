@@ -151,6 +151,12 @@ class Outbox:
         with self._told():
             self._file.execute("UPDATE places SET asked = 1 WHERE key = ?", (key,))
 
+    def unanswered(self, key: str) -> bool:
+        """Whether a keyframe waits here whose query was not answered."""
+        with self._told():
+            row = self._file.execute("SELECT asked FROM places WHERE key = ?", (key,)).fetchone()
+        return row is not None and not row[0]
+
     def drop(self, key: str) -> None:
         """Forget a keyframe that need not be sent."""
         with self._told():

@@ -67,9 +67,7 @@ class Companions:
         for topic, policy in list(self._mismatches.items()):
             del self._mismatches[topic]
             ours = qos_in_words(self._subscriptions[topic].qos_profile)
-            self._node.get_logger().warning(
-                f"a publisher of {topic} is not heard: its {policy} does not suit {ours}"
-            )
+            self._node.get_logger().warning(f"a publisher of {topic} is not heard: its {policy} does not suit {ours}")
 
     def _subscribe(self, kind: type, topic: str, receive: Callable[[Any], None]) -> None:
         def mismatch(info: Any) -> None:

@@ -118,7 +118,7 @@ def drive(node: Node, walk: Sequence, robots: list[Robot], environment: dict, ur
             robot.images.publish(rgb_to_message(frame.rgb, frame.stamp_ns, "camera"))
         spin(node, 0.7)
         shown = step + 1
-        until(node, lambda m=moving, n=shown: all(r.done >= n - 2 for r in m), _START_S, "the nodes to follow")
+        until(node, lambda m=moving, n=shown: all(r.done >= n - 1 for r in m), _START_S, "the nodes to follow")
     spin(node, 2.5)
     until(node, lambda: all(r.count("fleet: keyframes waiting") == 0 for r in robots), _SETTLE_S, "the outboxes")
     spin(node, 2.0)

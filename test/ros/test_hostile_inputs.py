@@ -146,5 +146,3 @@ def test_a_flag_that_ros_does_not_know_is_one_line():
     assert node.wait(60) == 2
     assert "Traceback" not in node.output
     assert "place_recognizer: " in node.output
-
-
