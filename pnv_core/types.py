@@ -159,6 +159,7 @@ class Evidence:
     texture: float = 1.0  # the lesser of both images, in [0, 1]
     local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined, -2: no picture to examine
     local_spread: float = 0.0  # of those
+    local_matches: int = 0  # local features that matched at all, whether they agree or not
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
 
 

@@ -25,7 +25,7 @@ REASONS = {
     Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency)",
     Reason.ODOMETRY: "the jump is impossible by odometry",
     Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms",
-    Reason.NOT_VERIFIED: "not among the best that local features examined (verify)",
+    Reason.NOT_VERIFIED: "not among the best that local features examined (verify), or too few of them agree",
     Reason.AMBIGUOUS: "a place far from the match is supported about alike, and too few keyframes agree yet",
 }
 DROPS = {

@@ -42,6 +42,7 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
         "local_inliers": lambda e: math.log(max(e.local_inliers, CHANCE) / CHANCE),
         "local_spread": lambda e: e.local_spread,
+        "local_share": lambda e: max(e.local_inliers, 0) / (e.local_matches + CHANCE),
     },
 }
 _VALUES = _FEATURES["patches"] | _FEATURES["verified"]

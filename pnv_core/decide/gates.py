@@ -8,6 +8,7 @@ from pnv_core.decide.consistency import DOUBT, PRIOR, SequenceMemory, confirmed,
 from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
+_AGREE = 0.55  # share of the matched local features; look-alike walls have less (median 0.45), true revisits 0.6 to 0.9
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
@@ -27,7 +28,8 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
     belief = max(closure.score, path.belief) if agreed else closure.score
     if belief < config.accept_score:
         return replace(closure, reason=Reason.LOW_SCORE)
-    if config.verify and evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE:
+    unexamined = evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE
+    if config.verify and (unexamined or chancy(evidence)):
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)
@@ -38,6 +40,11 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         if not confirmed(longer, wanted + DOUBT):
             return replace(closure, reason=Reason.AMBIGUOUS)
     return replace(closure, score=belief, accepted=True)
+
+
+def chancy(evidence: Evidence) -> bool:
+    """Whether of the local features that matched too few agree on one geometry: what is left may agree by chance."""
+    return 0 <= evidence.local_inliers < _AGREE * evidence.local_matches
 
 
 def ambiguous(evidence: Evidence) -> bool:

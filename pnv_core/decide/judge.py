@@ -70,7 +70,12 @@ class Judge:
             picture = references[number].thumbnail
             if descriptor.thumbnail and picture:
                 check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
-                seen = replace(evidence, local_inliers=check.inliers, local_spread=check.spread)
+                seen = replace(
+                    evidence,
+                    local_inliers=check.inliers,
+                    local_spread=check.spread,
+                    local_matches=len(check.inlier),
+                )
                 verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
                 found[place] = verified, seen, number
         # what ranked lower and was not examined is not believed more than what was; what has no picture stands by

@@ -61,5 +61,15 @@ def test_a_frame_that_speaks_against_a_place_is_not_outvoted():
     assert decided(closure, CONFIG, sequence).reason is Reason.LOW_SCORE
 
 
+@pytest.mark.parametrize(("matches", "accepted"), [(40, True), (60, False)])
+def test_where_most_matched_features_disagree_a_closure_is_not_verified(matches, accepted):
+    closure = seen(100, 10, 0.95, inliers=30, rival=0)
+    closure = replace(closure, evidence=replace(closure.evidence, local_matches=matches))
+    sequence = SequenceMemory()
+    sequence.remember("front", [closure], window_of(CONFIG.consistency + DOUBT))
+    final = decided(closure, CONFIG, sequence)
+    assert (final.accepted, final.reason) == (accepted, Reason.ACCEPTED if accepted else Reason.NOT_VERIFIED)
+
+
 def test_without_consistency_a_score_stands_for_itself():
     assert verdicts(1, 0.7, inliers=30, rival=25, config=replace(CONFIG, consistency=0, sure_score=1.1)) == [None]
