@@ -283,7 +283,8 @@ def main() -> int:
         rows = [patches_row(k, d, args.threads, args.rounds) for k, d in settings]
         count = 10 if args.quick else 100
         rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
-        rows.append(reranking_row(128, "ransac", count, args.threads, 1 if args.quick else args.rounds))
+        for scorer in ("ransac", "usac"):
+            rows.append(reranking_row(128, scorer, count, args.threads, 1 if args.quick else args.rounds))
         rows.append(trunk_row("compact trunk", compact_trunk(), (288, 384), args.threads, 5 * args.rounds))
         sizes = ((320, 240),) if args.quick else ((320, 240), (384, 288), (640, 480))
         rows += [describing_row(size, args.threads, 5 * args.rounds) for size in sizes]

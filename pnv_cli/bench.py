@@ -16,7 +16,7 @@ from pnv_core.config import Config
 from pnv_core.errors import ConfigError
 
 _SHARES = (1.0, 0.75, 0.5)  # of the size the model was made for; larger ones gain nothing without another model
-_SCORERS = ("ransac", "rapid")
+_SCORERS = ("usac", "rapid")
 _CANDIDATES = (50, 25, 10, 5, 3)
 _LEAST_CANDIDATES = 5  # fewer lose places that retrieval ranks lower
 _LOAD = 0.7  # share of the time between keyframes; the rest is for decoding, publishing and other processes
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
 def proposal(measured: Sequence[Measured], rate: float) -> tuple[Measured, int] | None:
     """The setting to take: larger images before RANSAC before more candidates, all within the time."""
     within = 1000.0 / rate * _LOAD
-    ranked = sorted(measured, key=lambda m: (-m.width * m.height, m.scorer != "ransac"))
+    ranked = sorted(measured, key=lambda m: (-m.width * m.height, m.scorer == "rapid"))
     for m in ranked:
         for candidates in _CANDIDATES:
             if candidates >= _LEAST_CANDIDATES and m.total_ms(candidates) <= within:
@@ -151,7 +151,7 @@ def _measure(config: Config, images: Sequence[NDArray[np.uint8]], seconds: float
     kilobytes = (patches * describer.model.patch_dim * bytes_per_value + 4 * describer.model.global_dim) / 1e3
     results = []
     pairs = [(a, b) for a in range(len(images)) for b in range(len(images)) if a != b]
-    scorers = _SCORERS if config.scorer == "ransac" else (config.scorer,)
+    scorers = _SCORERS if config.scorer != "rapid" else (config.scorer,)
     for scorer in scorers:
         reranker = Reranker(describer.config.replace(scorer=scorer))
 

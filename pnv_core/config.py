@@ -97,7 +97,11 @@ class Config:
     index: str = setting("auto", "index of the global vectors: auto, exact, pq, or a registered name")
 
     _reranking = Section("Re-ranking")
-    scorer: str = setting("ransac", "spatial score of patch matches", choices=("ransac", "rapid"))
+    scorer: str = setting(
+        "usac",
+        "spatial score of patch matches: ransac as the authors run it, usac far sooner, rapid without a geometry",
+        choices=("usac", "ransac", "rapid"),
+    )
     scale_weight: float = setting(
         0.3,
         "share of its RANSAC score that a candidate seen from nearer or farther loses at most; 0 = the paper's score",

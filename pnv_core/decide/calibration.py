@@ -163,9 +163,13 @@ def fit_calibration(
     return Calibration(models["patches"], models["verified"], source=source, **_evidence_settings(config))
 
 
+_LIKE = {"usac": "ransac"}  # finds its inliers but for a few, so a calibration serves both
+
+
 def _evidence_settings(config: Config) -> dict[str, Any]:
     names = ("scorer", "patch_sizes", "patch_strides", "patch_weights", "scale_weight", "verifier")
-    return {name: getattr(config, name) for name in names} | {"image_size": (config.image_width, config.image_height)}
+    held = {name: getattr(config, name) for name in names} | {"image_size": (config.image_width, config.image_height)}
+    return held | {"scorer": _LIKE.get(config.scorer, config.scorer)}
 
 
 def _fit_logistic(

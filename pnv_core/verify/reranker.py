@@ -9,10 +9,13 @@ from numpy.typing import NDArray
 from pnv_core.config import Config
 from pnv_core.threads import workers
 from pnv_core.types import PatchMatches, PlaceDescriptor
+from pnv_core.verify.homography import homography_inliers, usac_inliers
 from pnv_core.verify.matching import Indices, mutual_nearest_rows, patch_rows
 from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score, scale_change
 
 Rows = NDArray[np.float32]  # patch descriptors made ready for matching
+
+_SEARCHES = {"ransac": homography_inliers, "usac": usac_inliers}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +36,7 @@ class Reranker:
     """Scores candidates by their patches, with the scorer and weights of a (completed) Config."""
 
     def __init__(self, config: Config) -> None:
-        self.scorer = config.scorer
+        self.search = _SEARCHES.get(config.scorer)  # None: the rapid score, without a geometry
         self.weights = config.patch_weights
         self.scale_weight = config.scale_weight
         self.workers = workers(config.threads)
@@ -55,16 +58,16 @@ class Reranker:
         scores = []
         found = []
         for q, r, pairs in zip(query.patches, reference.patches, matches, strict=True):
-            if self.scorer == "ransac":
-                score, inlier = ransac_score(q, r, pairs)
+            if self.search is not None:
+                score, inlier = ransac_score(q, r, pairs, self.search)
             else:
                 score, inlier = rapid_spatial_score(q, r, pairs), np.zeros(len(pairs[0]), bool)
             scores.append(score)
             xy = q.keypoints()[pairs[0]], r.keypoints()[pairs[1]]
             found.append(PatchMatches(q.size, pairs[0], pairs[1], inlier, *xy))
-        counted = sum(int(m.inlier.sum()) if self.scorer == "ransac" else len(m.query) for m in found)
+        counted = sum(int(m.inlier.sum()) if self.search is not None else len(m.query) for m in found)
         fused = fused_score(scores, self.weights)
-        if self.scorer == "ransac" and self.scale_weight and fused:
+        if self.search is not None and self.scale_weight and fused:
             fused *= 1.0 - self.scale_weight * scale_change(found)
         return SpatialResult(fused, tuple(scores), tuple(found), counted)
 

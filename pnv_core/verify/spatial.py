@@ -1,7 +1,7 @@
 """Spatial scores of matched patches, in [0, 1], larger is better (Patch-NetVLAD section 3.4)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,14 @@ _SMALLEST_SLOPE = 0.05
 
 
 def ransac_score(
-    query: PatchGrid, reference: PatchGrid, matches: tuple[NDArray[np.int64], NDArray[np.int64]]
+    query: PatchGrid,
+    reference: PatchGrid,
+    matches: tuple[NDArray[np.int64], NDArray[np.int64]],
+    search: Callable[[NDArray[np.float32], NDArray[np.float32], float], NDArray[np.bool_]] = homography_inliers,
 ) -> tuple[float, NDArray[np.bool_]]:
     """Share of the query's patches that a homography reference -> query explains, and which matches (M,) do.
 
+    `search` finds the inliers: `homography_inliers` those of the authors' code, `usac_inliers` nearly those, sooner.
     Fewer than four matches, or no homography (all on one line), give 0.
     """
     q, r = matches
@@ -29,7 +33,7 @@ def ransac_score(
     tolerance = query.cell * query.stride * RANSAC_TOLERANCE_CELLS
     source = reference.keypoints()[r].astype(np.float32)
     target = query.keypoints()[q].astype(np.float32)
-    inlier = homography_inliers(source, target, tolerance)
+    inlier = search(source, target, tolerance)
     return float(inlier.sum()) / (query.rows * query.cols), inlier
 
 

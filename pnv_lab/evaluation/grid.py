@@ -35,7 +35,7 @@ def grid_search(evaluation: Evaluation, dataset: Dataset, sizes: Sequence[int], 
 
     Each size is matched once; settings are then compared on the stored scores. Ties go to fewer and smaller sizes.
     """
-    base = METHODS[f"multi-{scorer}"]
+    base = METHODS["multi-ransac" if scorer == "usac" else f"multi-{scorer}"]
     methods = [replace(base, name=f"{base.name}[sizes={s}]", sizes=(s,)) for s in sizes]
     asked = dataset.take([q for q, true in enumerate(dataset.truth) if len(true)])
     results = evaluation.run(asked, methods)
