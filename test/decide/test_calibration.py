@@ -53,7 +53,11 @@ def test_the_fit_finds_the_probability_the_examples_were_drawn_with():
 @settings(max_examples=60, deadline=None)
 @given(
     st.sampled_from(
-        [f.name for f in dataclasses.fields(Evidence) if f.name not in ("texture", "distortion", "inliers")]
+        [
+            f.name
+            for f in dataclasses.fields(Evidence)
+            if f.name not in ("texture", "distortion", "inliers", "local_matches")
+        ]
     ),
     st.floats(0, 1),
     st.integers(0, 3),
@@ -67,9 +71,8 @@ def test_more_of_any_evidence_never_lowers_the_score(name, step, seed):
     raised = dataclasses.replace(e, **{name: getattr(e, name) + more})
     for calibration in (fitted, CONSERVATIVE):
         assert calibration.probability(raised) >= calibration.probability(e) - 1e-12
-        assert calibration.probability(dataclasses.replace(e, distortion=e.distortion + step)) <= (
-            calibration.probability(e) + 1e-12
-        )
+        for against in ({"distortion": e.distortion + step}, {"local_matches": e.local_matches + round(step * 40)}):
+            assert calibration.probability(dataclasses.replace(e, **against)) <= calibration.probability(e) + 1e-12
 
 
 def test_an_unknown_model_believes_no_candidate_on_its_patches_alone():
