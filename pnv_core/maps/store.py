@@ -68,7 +68,7 @@ class MapStore:
     """
 
     def __init__(self, path: str | os.PathLike[str], fingerprint: str, *, replace: bool = False) -> None:
-        self.path = Path(path)
+        self.path = Path(path).absolute()  # a program that changes its folder later saves to the same map
         self.fingerprint = fingerprint
         self._replace = replace
         self._known: Manifest | None = None  # what is on disk, as far as this store knows
