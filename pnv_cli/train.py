@@ -11,6 +11,9 @@ from pnv_cli.common import writable
 from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
 
+_VARIANT = 1  # of EfficientNet-Lite
+_POOLED_SHARE = 0.75  # of the cosine; chosen on the development sets, see MODEL_CARD.md
+
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     what = "Trains a model for places: hours on a CPU, minutes with --pool."
@@ -21,10 +24,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         "--folder", metavar="DIR", help="checkpoint, metrics and plot; default: the output's name + .train"
     )
     parser.add_argument(
-        "--trunk", choices=("compact", "vgg16"), default="compact", help="vgg16: the paper's training, its settings"
+        "--trunk", choices=("lite", "vgg16"), default="lite", help="vgg16: the paper's training, its settings"
     )
     parser.add_argument(
-        "--imagenet", required=True, metavar="FILE", help="ImageNet weights of the trunk (.pth, torchvision names)"
+        "--imagenet", required=True, metavar="FILE", help="ImageNet weights of the trunk (.pth; the published names)"
     )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
     parser.add_argument("--threads", type=int, default=2)
@@ -37,12 +40,12 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         help="groups of 80 views rendered once and kept as maps of the frozen layers (for a CPU); 0 = none",
     )
     parser.add_argument("--clusters", type=int, default=16, help="K (default 16)")
-    parser.add_argument("--neck", type=int, default=128, help="channels after the compact trunk (default 128)")
+    parser.add_argument("--neck", type=int, default=128, help="channels after the lite trunk (default 128)")
     parser.add_argument("--global-dim", type=int, default=512)
-    parser.add_argument("--pooled-dim", type=int, default=192, help="of --global-dim, for the pooled features")
+    parser.add_argument("--pooled-dim", type=int, default=384, help="of --global-dim, for the pooled features")
     parser.add_argument("--patch-dim", type=int, default=128)
-    parser.add_argument("--size", default="384x288", help="input size of the compact model (default 384x288)")
-    parser.add_argument("--view", default="320x240", help="size of the views it is trained on (default 320x240)")
+    parser.add_argument("--size", default="384x288", help="input size of the lite model (default 384x288)")
+    parser.add_argument("--view", default="384x288", help="size of the views it is trained on (default 384x288)")
     parser.add_argument("--places", type=int, default=40, help="places a batch (default 40)")
     parser.add_argument("--views", type=int, default=3, help="views a place (default 3)")
     parser.add_argument(
@@ -68,40 +71,43 @@ def run(args: argparse.Namespace) -> int:
     if args.trunk == "vgg16":
         _train_vgg16(args, folder, output)
     else:
-        _train_compact(args, folder, output)
+        _train_lite(args, folder, output)
     return 0
 
 
-def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None:
+def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
     import numpy as np
 
     from pnv_core.describe.model_files import ModelInfo, save_model
-    from pnv_core.describe.trunks.compact import FIRES
     from pnv_lab.fit import FitOptions
     from pnv_lab.training.batches import BatchOptions, PlaceBatches
-    from pnv_lab.training.initial import imagenet_trunk, initial_model
+    from pnv_lab.training.initial import imagenet_trunk, initial_model, whitened
     from pnv_lab.training.pool import FeaturePool
     from pnv_lab.training.trainer import Trainer, TrainOptions
 
     if not 1 <= args.pooled_dim < args.global_dim:
         raise ConfigError(f"--pooled-dim {args.pooled_dim}; allowed: 1 to {args.global_dim - 1}, below --global-dim")
     given = {"seed": args.seed} if args.seed is not None else {}
-    options = _options(TrainOptions, args.set, **given)
+    options = _options(TrainOptions, args.set, **({"steps": 0} | given))
     size, view = _size(args.size), _size(args.view)
     trained, held = _split(args.data)
-    trunk = imagenet_trunk(args.imagenet, fires=FIRES, relu=True)
-    layers = options.frozen_layers
+    trunk = imagenet_trunk(args.imagenet, _VARIANT)
+    layers = min(options.frozen_layers, trunk.depth - 1)
     # the pool draws four views a place; a training batch takes some of them
-    drawn = BatchOptions(places=20, views=4, neighbours=4, sizes=(view,), seed=options.seed + 7)
+    drawn = BatchOptions(
+        places=20, views=4, neighbours=4, sizes=(view,), forward=0.0, thumbnails=0.1, zoom=0.3, squeezed=0.4,
+        seed=options.seed + 7,
+    )  # fmt: skip
     rendered = PlaceBatches(trained, drawn)
     pool = FeaturePool(folder / "pool", rendered, args.pool or 20, args.places, args.views)
     pool.build(trunk, layers, bar(range(pool.groups), desc="views", unit="group"))
     info = ModelInfo(
-        "compact",
-        {"fires": FIRES, "neck": args.neck, "relu": True},
+        "lite",
+        {"variant": _VARIANT, "neck": args.neck},
         *size,
         patch_sizes=(2,),  # as good as any set of sizes 1 to 3 on the development sets, for the least memory
         patch_weights=(1.0,),
+        pooled_share=_POOLED_SHARE,
         provenance=f"pnv train, seed {options.seed}, {options.steps} steps on {len(trained)} images; see MODEL_CARD.md",
     )
     fit = FitOptions(
@@ -109,15 +115,20 @@ def _train_compact(args: argparse.Namespace, folder: Path, output: Path) -> None
         global_dim=args.global_dim,
         pooled_dim=args.pooled_dim,
         patch_dim=args.patch_dim,
-        patches_per_image=12,
+        patch_sizes=(2,),
+        seed=options.seed,
     )
-    model = initial_model(trunk, args.neck, pool.mild_maps, layers, info, fit)
+    model = initial_model(trunk, args.neck, pool, layers, info, fit)
+    if not options.steps:
+        save_model(model.model(), output, np.float16)
+        print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")
+        return
     fresh = BatchOptions(places=args.places, views=args.views, sizes=(view,), seed=options.seed)
     batches = pool if args.pool else PlaceBatches(trained, fresh)
     settings = {"places": args.places, "views": args.views, "pool": args.pool, "fit": asdict(fit)}
     trainer = Trainer(model, batches, _validation(held), options, folder, args.device, settings)
     model = trainer.run(lambda items, done, total: bar(items, desc="training", initial=done, total=total, unit="step"))
-    save_model(model.model(), output, np.float16)
+    save_model(whitened(model, pool, layers, fit).model(), output, np.float16)
     _report(trainer.journal, folder, output)
 
 
@@ -174,16 +185,20 @@ def _split(folders: Iterable[str]) -> tuple[list[Any], list[Any]]:
 
     sets: list[Path] = []
     for folder in map(Path, folders):
-        if (folder / "images").is_dir():
+        if _is_set(folder):
             sets.append(folder)
-        elif folder.is_dir() and (found := sorted(f for f in folder.iterdir() if (f / "images").is_dir())):
+        elif folder.is_dir() and (found := sorted(f for f in folder.iterdir() if _is_set(f))):
             sets += found
         else:
-            raise ConfigError(f"{folder}: no training folder; allowed: one with images/, or a folder of such folders")
+            raise ConfigError(f"{folder}: no training folder; allowed: one with images/ or panos/, or a folder of such")
     images = [image for folder in bar(sets, desc="sets", unit="set") for image in load_set(folder)]
     held = [image for image in images if is_held(image)]
     chosen = set(map(id, held))
     return [image for image in images if id(image) not in chosen], held
+
+
+def _is_set(folder: Path) -> bool:
+    return (folder / "images").is_dir() or (folder / "panos").is_dir()
 
 
 def _validation(held: list[Any]) -> list[Any]:

@@ -122,6 +122,36 @@ def pca(samples: Tensor, dimensions: int, whiten: bool) -> tuple[Tensor, Tensor]
     return weight, -(weight @ mean)
 
 
+def learned_whitening(
+    samples: Tensor, places: Tensor, dimensions: int, shrinkage: float = 0.1
+) -> tuple[Tensor, Tensor]:
+    """(M, N) and the place (M,) that each shows -> weight (D, N) and bias (D,), as `pca`.
+
+    The scatter within places is whitened, so that what changes between views of a place weighs little; then the
+    principal directions of the whole are kept (Radenovic et al., TPAMI 2018, section 3.4). The scatter is shrunk
+    towards a multiple of the identity by `shrinkage`. Raises ModelError for fewer second views than dimensions.
+    """
+    _, place, views = torch.unique(places, return_inverse=True, return_counts=True)
+    second = len(samples) - len(views)
+    if min(second, samples.shape[1]) < dimensions:
+        raise ModelError(
+            f"{second} second views of a place, of {samples.shape[1]} values, cannot fit {dimensions} dimensions; "
+            f"allowed: at most {min(second, samples.shape[1])}"
+        )
+    means = torch.zeros(len(views), samples.shape[1]).index_add_(0, place, samples) / views[:, None]
+    within = (samples - means[place]) * (views / (views - 1).clamp(min=1)).sqrt()[place, None]
+    scatter = (within.T @ within).double() / int((views > 1)[place].sum())
+    level = shrinkage * scatter.trace() / len(scatter)
+    scatter.diagonal().add_(level)
+    whitening = torch.linalg.inv(torch.linalg.cholesky(scatter))
+    mean = samples.mean(0)
+    spread = whitening @ torch.cov(samples.T).double() @ whitening.T
+    directions = torch.linalg.eigh(spread).eigenvectors.flip(1)[:, :dimensions].T
+    weight = (directions @ whitening).float()
+    weight /= weight.norm(dim=1).mean()  # what is projected is made unit: its scale is free
+    return weight, -(weight @ mean)
+
+
 def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
     """No progress bar."""
     return items
@@ -154,8 +184,13 @@ def local_samples(maps: Iterable[Tensor], options: FitOptions) -> Tensor:
 
 @torch.no_grad()
 def vocabulary_of(maps: Iterable[Tensor], options: FitOptions) -> NetVLAD:
-    """A NetVLAD layer from feature maps: clusters by spherical k-means, assignment by the alpha rule."""
-    samples = local_samples(maps, options)
+    """A NetVLAD layer from feature maps."""
+    return vocabulary(local_samples(maps, options), options)
+
+
+@torch.no_grad()
+def vocabulary(samples: Tensor, options: FitOptions) -> NetVLAD:
+    """A NetVLAD layer from unit local features (M, C): clusters by spherical k-means, assignment by the alpha rule."""
     netvlad = NetVLAD(options.clusters, samples.shape[1])
     centroids = spherical_kmeans(samples, options.clusters, torch.Generator().manual_seed(options.seed))
     netvlad.load_state_dict({"centroids": centroids, "assignment": alpha_rule(centroids, samples)})
@@ -178,10 +213,10 @@ def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions
             parts.append(vlads[torch.randperm(len(vlads), generator=generator)[:count]])
     most = len(whole) // SAMPLES_PER_DIMENSION if options.whiten else len(whole) - 1
     return (
-        _projection(
+        projection_of(
             *pca(torch.stack(whole), max(1, min(options.global_dim - options.pooled_dim, most)), options.whiten)
         ),
-        _projection(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
+        projection_of(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
     )
 
 
@@ -189,7 +224,7 @@ def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions
 def pooled_projection_of(maps: Iterable[Tensor], options: FitOptions) -> Projection:
     """The projection of the generalised means of maps (W, h, w), by PCA."""
     pooled = torch.cat([gem(m[None].float()) for m in maps])
-    return _projection(*pca(pooled, options.pooled_dim, options.whiten))
+    return projection_of(*pca(pooled, options.pooled_dim, options.whiten))
 
 
 def fit_vocabulary(
@@ -212,7 +247,7 @@ def adapted_projection(projection: Projection, vlads: Tensor, shrinkage: float =
     shrunk = (1 - shrinkage) * covariance + shrinkage * level * torch.eye(len(covariance), dtype=torch.float64)
     values, vectors = torch.linalg.eigh(shrunk / level)
     whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
-    return _projection(whitening @ projection.weight, whitening @ (projection.bias - mean))
+    return projection_of(whitening @ projection.weight, whitening @ (projection.bias - mean))
 
 
 @torch.no_grad()
@@ -258,7 +293,8 @@ def fit_model(
     return TorchModel(info, trunk, netvlad, whole, parts)
 
 
-def _projection(weight: Tensor, bias: Tensor) -> Projection:
+def projection_of(weight: Tensor, bias: Tensor) -> Projection:
+    """A linear map as a layer."""
     projection = Projection(weight.shape[1], weight.shape[0])
     projection.load_state_dict({"weight": weight, "bias": bias})
     return projection

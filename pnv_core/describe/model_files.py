@@ -40,6 +40,7 @@ class ModelInfo:
     image_height: int = 480
     patch_sizes: tuple[int, ...] = (2, 5, 8)
     patch_weights: tuple[float, ...] = (0.45, 0.15, 0.4)
+    pooled_share: float = 0.5  # of the cosine of two global vectors, where a part of them is pooled
     provenance: str = ""
     calibration: dict[str, Any] | None = None
 
@@ -49,9 +50,9 @@ class Model:
     """A describing network: what its file says and its tensors in float32, by name, as `build_model` checks them.
 
     Without the part `patch_projection` patches share the global one, as in the paper. With `pooled_projection` the
-    global vector is the projected VLAD beside the projected generalised mean of the map before the trunk's neck, with
-    equal weights: it keeps how strongly features respond, which VLAD's unit local descriptors do not. Without it (every
-    published model) the global vector is the projected VLAD.
+    global vector is the projected VLAD beside the projected generalised mean of the map before the trunk's neck,
+    weighed by `pooled_share`: it keeps how strongly features respond, which VLAD's unit local descriptors do not.
+    Without it (every published model) the global vector is the projected VLAD.
     """
 
     info: ModelInfo
@@ -87,8 +88,10 @@ class Model:
         return len(self.tensors[f"{self.patches_projection}.bias"])
 
     def fingerprint(self) -> str:
-        """sha256 over the tensors and the trunk's name: equal fingerprints describe alike."""
-        digest = hashlib.sha256(json.dumps([self.info.trunk, self.info.trunk_options], sort_keys=True).encode())
+        """sha256 over the tensors, the trunk's name and the pooled share: equal fingerprints describe alike."""
+        share = [] if self.info.pooled_share == 0.5 else [self.info.pooled_share]
+        kind = [self.info.trunk, self.info.trunk_options, *share]
+        digest = hashlib.sha256(json.dumps(kind, sort_keys=True).encode())
         for name, tensor in sorted(self.tensors.items()):
             digest.update(f"{name}{tuple(tensor.shape)}".encode())
             digest.update(np.ascontiguousarray(tensor, "<f4").data)
@@ -212,6 +215,7 @@ def _info(metadata: dict[str, str], source: str) -> ModelInfo:
         image_height=part("image_height", _Side),
         patch_sizes=sizes,
         patch_weights=weights,
+        pooled_share=part("pooled_share", _Weight) if "pooled_share" in metadata else ModelInfo.pooled_share,
         provenance=metadata.get("provenance", ""),
         calibration=calibration,
     )

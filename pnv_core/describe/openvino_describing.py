@@ -116,8 +116,9 @@ def _global_vector(model: Model, x: Node, weights: Node, wide: Node, counted: No
         area = ops.maximum(ops.reduce_sum(counted, integers(2, 3), False), constant(1e-6))
         mean = ops.maximum(ops.divide(total, area), constant(1e-18))
         pooled = _unit(ops.power(mean, constant(1 / 3)), 1)
-        both = ops.concat([vector, _projected(model, "pooled_projection", pooled)], 1)
-        vector = ops.multiply(both, constant(np.sqrt(0.5)))
+        share = model.info.pooled_share
+        halves = ((vector, 1 - share), (_projected(model, "pooled_projection", pooled), share))
+        vector = ops.concat([ops.multiply(half, constant(np.sqrt(part))) for half, part in halves], 1)
     return ops.reshape(vector, integers(-1), False)
 
 

@@ -111,7 +111,9 @@ class TorchModel:
         vector: Tensor = self.global_projection(vlad)
         if self.pooled_projection is None:
             return vector
-        return torch.cat([vector, self.pooled_projection(gem(wide, cells))], dim=1) * math.sqrt(0.5)
+        share = self.info.pooled_share
+        pooled = self.pooled_projection(gem(wide, cells))
+        return torch.cat([vector * math.sqrt(1 - share), pooled * math.sqrt(share)], dim=1)
 
 
 class TorchDescribing:

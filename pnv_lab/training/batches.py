@@ -7,18 +7,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from pnv_core.describe.trunks.trunk import Trunk
 from pnv_lab.training.augment import Camera, View, flat_view, panorama_view, relight, thumbnail
 from pnv_lab.training.sources import DEFAULT_RULE, RULES, PlaceImage, relation
 
-PANORAMA_WEIGHT = 12.0  # a panorama holds this many times more views than a photograph
+PANORAMA_WEIGHT = 36.0  # a panorama holds this many times more views than a photograph
 _SAME_YAW, _OTHER_YAW = np.deg2rad(20), np.deg2rad(75)
 _FORWARD = 1.6  # magnification that makes a place another one: a revisit closes a loop where the robot stood
 _SAME_ADVANCE, _OTHER_ADVANCE = 1.2, 1.5
 _SMALL_WIDTH = (72, 140)  # pixels
+_ASPECT = (-0.6, 0.2)  # log of the width over the height of a squeezed view, as a multiple of its batch's
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,8 @@ class BatchOptions:
     strength: float = 1.0
     forward: float = 0.5  # share of the groups of neighbours in which places lie in front of one another
     thumbnails: float = 0.2  # share of the batches whose views all were stored small
+    zoom: float = 0.0  # most |log| of how much nearer or farther the views of a place look
+    squeezed: float = 0.0  # share of the views of another aspect, squeezed into the size as describing does
     seed: int = 0
 
 
@@ -134,16 +139,37 @@ class PlaceBatches:
         return replace(anchor, image=self.images[int(rng.choice(others))]) if others else anchor
 
     def _view(self, origin: Origin, size: tuple[int, int], strength: float, rng: np.random.Generator) -> View:
+        view = self._rendered(origin, self._shape(size, rng), strength, rng)
+        if view.pixels.shape[:2] != (size[1], size[0]):
+            view = _squeezed(view, size)
+        occluder = self.images[int(rng.integers(len(self.images)))].rgb
+        return View(relight(view.pixels, strength, rng, occluder), view.coordinates)
+
+    def _shape(self, size: tuple[int, int], rng: np.random.Generator) -> tuple[int, int]:
+        """(width, height) that a view is taken with: its own aspect, from portrait to wide, where it is squeezed."""
+        if not rng.random() < self.options.squeezed:
+            return size
+        aspect = np.exp(rng.uniform(*_ASPECT))
+        width, height = size[0] * max(aspect, 1.0), size[1] / min(aspect, 1.0)
+        return 16 * round(width / 16), 16 * round(height / 16)
+
+    def _rendered(self, origin: Origin, size: tuple[int, int], strength: float, rng: np.random.Generator) -> View:
+        advance = origin.advance * np.exp(rng.uniform(-1, 1) * self.options.zoom)
         if origin.image.panorama:
-            reach = np.tan(np.deg2rad(rng.uniform(75, 92)) / 2) / origin.advance
+            reach = np.tan(np.deg2rad(rng.uniform(75, 92)) / 2) / advance
             field_of_view = 2 * float(np.arctan(reach))
             pitch, roll = rng.normal(0, 0.12) * strength, rng.normal(0, 0.06) * strength
             camera = Camera(origin.yaw, pitch, roll, field_of_view)
-            view = panorama_view(origin.image.rgb, size, camera, strength, origin.mirror, rng)
-        else:
-            view = flat_view(origin.image.rgb, size, strength, origin.mirror, rng, origin.advance)
-        occluder = self.images[int(rng.integers(len(self.images)))].rgb
-        return View(relight(view.pixels, strength, rng, occluder), view.coordinates)
+            return panorama_view(origin.image.rgb, size, camera, strength, origin.mirror, rng)
+        return flat_view(origin.image.rgb, size, strength, origin.mirror, rng, max(advance, 1.0))
+
+
+def _squeezed(view: View, size: tuple[int, int]) -> View:
+    cells = size[0] // Trunk.stride, size[1] // Trunk.stride
+    return View(
+        np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA), np.uint8),
+        np.asarray(cv2.resize(view.coordinates, cells, interpolation=cv2.INTER_NEAREST), np.float32),
+    )
 
 
 def assembled(origins: Sequence[Origin], inputs: Tensor, coordinates: Sequence[np.ndarray]) -> Batch:

@@ -19,8 +19,8 @@ from pnv_core.images import read_image
 
 Pose = tuple[float, float, float, float]  # x, y, z in metres, yaw in radians
 
-LONGER_SIDE = 400  # pixels kept of a training image; views are smaller
-PANORAMA_WIDTH = 1280
+LONGER_SIDE = 480  # pixels kept of a training image; views are smaller
+PANORAMA_WIDTH = 1600
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,9 @@ RULES: dict[str, SetRule] = {
     "opensfm_lund_berlin": SetRule(weight=1.0),
     "icl_office_kt3_synth": SetRule(same=5, weight=0.35),
     "ikuta_campus_loop": SetRule(other=2, weight=1.5),
+    # Panoramas: what may show one place has one alias (their ATTRIBUTION.txt).
+    "cubemap_places": SetRule(alias=r"(modern_buildings|teufelsberg|palermo)_.*", weight=0.4),
+    "panoramas": SetRule(alias=r"(uvic|wide_street|greenwich_park|afrikaans_church)_.*", weight=0.4),
 }
 
 # Kept out of training to validate on: whole floors, whole panoramas, whole sets.

@@ -36,7 +36,7 @@ class TrainOptions:
     vlad_lr: float = 1e-3
     projection_lr: float = 1e-3
     weight_decay: float = 1e-4
-    frozen_layers: int = 9  # leading layers of the trunk that keep their ImageNet weights
+    frozen_layers: int = 16  # leading layers of the trunk that keep their ImageNet weights
     patch_weight: float = 0.5  # of the patches' loss
     patch_pairs: int = 10  # image pairs of a batch that the patches' loss looks at
     patch_sizes: tuple[int, ...] = (2, 3, 4, 5)  # one drawn per step
@@ -127,16 +127,18 @@ class Trainer:
     def _groups(self) -> list[dict[str, Any]]:
         o = self.options
         rates = {
-            "trunk.features": o.trunk_lr,
             "trunk.neck": o.neck_lr,
+            "trunk": o.trunk_lr,
             "netvlad": o.vlad_lr,
             "whole": o.projection_lr,
             "parts": o.projection_lr,
             "pooled": o.projection_lr,
         }
+        left = {n: p for n, p in self.parts.named_parameters() if p.requires_grad}
         groups = []
         for prefix, rate in rates.items():
-            chosen = [p for n, p in self.parts.named_parameters() if n.startswith(prefix) and p.requires_grad]
+            chosen = [p for n, p in left.items() if n.startswith(prefix)]
+            left = {n: p for n, p in left.items() if not n.startswith(prefix)}
             if chosen:
                 groups.append({"params": chosen, "lr": rate})
         return groups

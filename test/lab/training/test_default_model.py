@@ -7,7 +7,7 @@ from pnv_core.describe.model_files import load_model
 def test_the_shipped_model_is_small_trained_and_has_a_card():
     model = load_model(DEFAULT_MODEL)
     assert DEFAULT_MODEL.stat().st_size < 20e6
-    assert model.info.trunk == "compact"
+    assert model.info.trunk == "lite"
     assert model.has("patch_projection")
     assert "pnv train" in model.info.provenance
     assert "pnv train" in (Path(DEFAULT_MODEL).parent / "MODEL_CARD.md").read_text()

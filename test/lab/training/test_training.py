@@ -10,7 +10,7 @@ from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
 from pnv_core.networks.layers import Conv
-from pnv_lab.fit import FitOptions
+from pnv_lab.fit import FitOptions, learned_whitening
 from pnv_lab.training.augment import Camera, flat_view, panorama_view, relight
 from pnv_lab.training.batches import BatchOptions, PlaceBatches
 from pnv_lab.training.initial import imagenet_trunk, initial_model
@@ -43,20 +43,20 @@ def killed_after(steps):
 def pool(picture_folder, imagenet_file, tmp_path):
     drawn = PlaceBatches(load_set(picture_folder), BatchOptions(places=4, views=3, neighbours=2, sizes=(VIEW,)))
     made = FeaturePool(tmp_path / "pool", drawn, groups=3, places=4, views=2)
-    made.build(imagenet_trunk(imagenet_file, 8, True), 11)
+    made.build(imagenet_trunk(imagenet_file, 1), 16)
     return made
 
 
 def trainer(pool, imagenet_file, folder, **changes):
-    info = ModelInfo("compact", {"fires": 8, "neck": 12, "relu": True}, *VIEW, (2,), (1.0,))
+    info = ModelInfo("lite", {"variant": 1, "neck": 12}, *VIEW, (2,), (1.0,))
     fit = FitOptions(
         clusters=3, global_dim=6, pooled_dim=3, patch_dim=5, image_width=96, image_height=80, patch_sizes=(2,)
     )
-    model = initial_model(imagenet_trunk(imagenet_file, 8, True), 12, pool.mild_maps, 11, info, fit)
+    model = initial_model(imagenet_trunk(imagenet_file, 1), 12, pool, 16, info, fit)
     options = TrainOptions(
         steps=6,
         warmup=2,
-        frozen_layers=11,
+        frozen_layers=16,
         patch_sizes=(2,),
         patch_pairs=3,
         save_every=2,
@@ -94,16 +94,16 @@ def test_frozen_layers_keep_their_weights(pool, imagenet_file, tmp_path):
     run = trainer(pool, imagenet_file, tmp_path / "run", trunk_lr=0.1, steps=2)
     before = {n: t.clone() for n, t in run.model.tensors().items()}
     after = run.run().tensors()
-    assert torch.equal(before["trunk.features.10.squeeze.weight"], after["trunk.features.10.squeeze.weight"])
-    assert not torch.equal(before["trunk.features.11.squeeze.weight"], after["trunk.features.11.squeeze.weight"])
+    assert torch.equal(before["trunk.blocks.14.project.weight"], after["trunk.blocks.14.project.weight"])
+    assert not torch.equal(before["trunk.expand.weight"], after["trunk.expand.weight"])
 
 
 def test_a_pool_gives_what_the_frozen_layers_give(pool, imagenet_file, picture_folder):
-    trunk = imagenet_trunk(imagenet_file, 8, True)
+    trunk = imagenet_trunk(imagenet_file, 1)
     origins, views = pool.batches.render(1)
     image = torch.from_numpy(views[4].pixels).permute(2, 0, 1)[None].float() / 255
     with torch.no_grad():
-        expected = trunk.front(image, 11)[0].numpy()
+        expected = trunk.front(image, 16)[0].numpy()
     found = np.asarray(pool.maps[1 * len(views) + 4], np.float32)
     assert np.abs(found - expected).max() <= 0.02 * np.abs(expected).max()  # bfloat16 and float16
     assert [o.image.name for o in pool.origins[1]] == [o.image.name for o in origins]
@@ -204,12 +204,12 @@ def test_triplet_training_resumes_at_the_last_cache(picture_folder, tmp_path):
 
 def test_a_pool_of_other_images_seed_layers_or_size_is_not_taken_for_this_one(pool, imagenet_file, picture_folder):
     """Whatever lies in the folder, a pool's maps are those of its own views."""
-    trunk = imagenet_trunk(imagenet_file, 8, True)
+    trunk = imagenet_trunk(imagenet_file, 1)
     images, options = pool.batches.images, pool.batches.options
     changes = {
-        "images": (PlaceBatches(images[1:], options), 3, 11),
-        "seed": (PlaceBatches(images, replace(options, seed=options.seed + 1)), 3, 11),
-        "larger": (pool.batches, 4, 11),
+        "images": (PlaceBatches(images[1:], options), 3, 16),
+        "seed": (PlaceBatches(images, replace(options, seed=options.seed + 1)), 3, 16),
+        "larger": (pool.batches, 4, 16),
         "layers": (pool.batches, 3, 8),
     }
     for name, (batches, groups, layers) in changes.items():
@@ -218,10 +218,51 @@ def test_a_pool_of_other_images_seed_layers_or_size_is_not_taken_for_this_one(po
         for group in range(groups):
             _, views = batches.render(group)
             pixels = torch.from_numpy(np.stack([v.pixels for v in views])).permute(0, 3, 1, 2).float() / 255
-            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
-                maps = trunk.front(pixels.contiguous(memory_format=torch.channels_last), layers).half().numpy()
-            assert np.array_equal(other.maps[group * len(views) : (group + 1) * len(views)], maps), name
+            with torch.inference_mode():
+                maps = trunk.front(pixels, layers).numpy()
+            found = np.asarray(other.maps[group * len(views) : (group + 1) * len(views)], np.float32)
+            assert np.abs(found - maps).max() < 1e-3 * np.abs(maps).max(), name
     again = FeaturePool(pool.folder, pool.batches, 3, places=4, views=2)
     pool.batches.render = lambda number: pytest.fail("what lies there was not used")
-    again.build(trunk, 11)
+    again.build(trunk, 16)
     assert np.array_equal(again.maps, pool.maps)
+
+
+def test_an_imagenet_file_is_read_with_its_batch_norms_folded(imagenet_file):
+    """Oracle: the stem and the first depthwise convolution with torch's own batch norm, in float64."""
+    tensors = {n: t.double() for n, t in torch.load(imagenet_file, weights_only=True).items()}
+    image = torch.rand(1, 3, 64, 64, dtype=torch.float64)
+
+    def normed(x, norm):
+        return torch.batch_norm(
+            x, tensors[f"{norm}.weight"], tensors[f"{norm}.bias"], tensors[f"{norm}.running_mean"],
+            tensors[f"{norm}.running_var"], False, 0.0, 1e-3, False,
+        )  # fmt: skip
+
+    x = torch.nn.functional.pad((255 * image - 127) / 128, (0, 1, 0, 1))
+    x = normed(torch.conv2d(x, tensors["_conv_stem.weight"], stride=2), "_bn0").clamp(0, 6)
+    x = normed(torch.conv2d(x, tensors["_blocks.0._depthwise_conv.weight"], padding=1, groups=32), "_blocks.0._bn1")
+    expected = normed(torch.conv2d(x.clamp(0, 6), tensors["_blocks.0._project_conv.weight"]), "_blocks.0._bn2")
+    found = imagenet_trunk(imagenet_file, 1).double().front(image, 2)
+    assert torch.allclose(found, expected, atol=1e-6)
+
+
+def test_learned_whitening_makes_the_scatter_within_places_white():
+    """And keeps the directions in which places differ most; oracle: NumPy."""
+    rng = np.random.default_rng(0)
+    mixing = rng.normal(size=(6, 6))
+    centres = rng.normal(size=(400, 6)) * np.array([5, 4, 3, 2, 1, 0.5])
+    places = np.repeat(np.arange(400), 3)
+    samples = (centres[places] + rng.normal(size=(1200, 6))) @ mixing.T
+    weight, bias = learned_whitening(torch.tensor(samples).float(), torch.tensor(places), 4, shrinkage=0.0)
+    found = samples @ weight.numpy().T + bias.numpy()
+    means = np.array([found[places == p].mean(0) for p in range(400)])
+    within = found - means[places]
+    scatter = within.T @ within
+    assert np.allclose(scatter / scatter.trace() * 4, np.eye(4), atol=0.02)
+    between = np.cov(found.T)
+    assert np.allclose(between, np.diag(np.diag(between)), atol=0.02 * between.max())
+    assert (np.diff(np.diag(between)) <= 0).all()
+    assert np.abs(found.mean(0)).max() < 1e-3
+    with pytest.raises(ModelError, match="second views"):
+        learned_whitening(torch.tensor(samples).float(), torch.arange(1200), 4)

@@ -4,7 +4,12 @@ import torch
 
 from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.describe.trunks.rootsift import rootsift_trunk
+
+
+def lite(variant, **options):
+    return TorchTrunk(lite_trunk(variant, **options))
 
 
 def compact(**options):
@@ -15,7 +20,9 @@ def rootsift():
     return TorchTrunk(rootsift_trunk())
 
 
-@pytest.mark.parametrize("trunk", [compact(), compact(fires=5, neck=0, relu=False), rootsift()])
+@pytest.mark.parametrize(
+    "trunk", [compact(), compact(fires=5, neck=0, relu=False), lite(1), lite(0, neck=0), rootsift()]
+)
 @pytest.mark.parametrize("size", [(480, 640), (240, 320), (100, 131)])
 def test_a_map_has_one_cell_per_sixteen_pixels(trunk, size):
     with torch.inference_mode():
@@ -23,16 +30,18 @@ def test_a_map_has_one_cell_per_sixteen_pixels(trunk, size):
     assert features.shape == (1, trunk.channels, size[0] // 16, size[1] // 16)
 
 
-@pytest.mark.parametrize("fires", [6, 8])
-def test_a_cell_of_the_compact_trunk_looks_at_pixels_around_its_centre(fires):
+@pytest.mark.parametrize(
+    "trunk", [compact(fires=6, neck=0), compact(fires=8, neck=0), lite(0, neck=0), lite(1, neck=0)]
+)
+def test_a_cell_looks_at_pixels_around_its_centre(trunk):
     """VGG16's cell i is centred at pixel 16 i + 7: keypoints of both trunks mean the same."""
     torch.manual_seed(0)
-    images = torch.rand(1, 3, 320, 320, dtype=torch.float64, requires_grad=True)
-    compact(fires=fires, neck=0).double()(images)[0, :, 10, 9].sum().backward()
+    images = torch.rand(1, 3, 640, 640, dtype=torch.float64, requires_grad=True)
+    trunk.double()(images)[0, :, 20, 19].sum().backward()
     touched = images.grad.abs().sum((0, 1))
     rows, cols = torch.nonzero(touched.sum(1)).flatten(), torch.nonzero(touched.sum(0)).flatten()
-    assert (rows.min() + rows.max()) / 2 == 16 * 10 + 7
-    assert (cols.min() + cols.max()) / 2 == 16 * 9 + 7
+    assert (rows.min() + rows.max()) / 2 == 16 * 20 + 7
+    assert (cols.min() + cols.max()) / 2 == 16 * 19 + 7
 
 
 def test_front_and_back_make_the_whole_trunk():
