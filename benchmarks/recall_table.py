@@ -6,8 +6,8 @@
 `dev`: viewpoint_places, pepper_s11 and what training held out of the tower and the panoramas (asked for by augmented
 views of its own images). `report`: webcams, essex, gardens and donkey; every look at them is counted in the model card.
 "patches" ranks by the spatial score alone (the paper), "re-ranked" by all evidence, as the recogniser does, but for
-local features. Baselines: the untrained trunk with GeM and with NetVLAD from k-means (no PCA), dense RootSIFT VLAD, each with a
-vocabulary fitted to the training photographs. The interval is Wilson's at 95 %. Queries are drawn by --seed.
+local features. Baselines: the untrained trunk with GeM and with NetVLAD from k-means (no PCA), dense RootSIFT VLAD,
+each with a vocabulary fitted to the training photographs. Intervals are Wilson's, 95 %. Queries are drawn by --seed.
 """
 
 import argparse

@@ -42,7 +42,7 @@ def lite_trunk(variant: int = 1, neck: int = 128) -> Trunk:
 def _inverted_residual(
     name: str, inputs: int, outputs: int, kernel: int, stride: int, expansion: int, pads: Pads
 ) -> Block:
-    """Expand, filter each channel, project (MobileNetV2, Sandler et al., CVPR 2018); added to its input if shapes allow."""
+    """Expand, filter each channel, project (MobileNetV2, Sandler et al., CVPR 2018); added to an input of its shape."""
     width = inputs * expansion
     expand: tuple[Layer, ...] = (Conv(f"{name}.expand", width), _RELU6) if expansion > 1 else ()
     depthwise = Conv(f"{name}.depthwise", width, kernel, stride, pads, groups=width), _RELU6
