@@ -120,10 +120,10 @@ def _corresponding_patches(
         nearest, index = distance.min(1)
         mutual = distance.argmin(0)[index] == torch.arange(len(index))
         chosen = torch.nonzero(mutual & (nearest < _PATCH_REACH)).flatten().numpy()
-        chosen = torch.from_numpy(rng.permutation(chosen)[:_PATCHES_A_PLACE])
-        found += [patches[0][chosen], patches[1][index[chosen]]]
-        numbers += [torch.arange(pairs, pairs + len(chosen))] * 2
-        pairs += len(chosen)
+        kept = torch.from_numpy(rng.permutation(chosen)[:_PATCHES_A_PLACE])
+        found += [patches[0][kept], patches[1][index[kept]]]
+        numbers += [torch.arange(pairs, pairs + len(kept))] * 2
+        pairs += len(kept)
     return torch.cat(found), torch.cat(numbers)
 
 
