@@ -178,8 +178,16 @@ def _within(run: tuple[int, int], runs: Runs) -> bool:
     return place >= 0 and runs[place][0] <= run[0] and run[1] <= runs[place][1]
 
 
+class NotFlushed(OSError):
+    """The manifest was replaced; whether that outlasts a power cut is not known."""
+
+
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Replace the manifest at once. Raises OSError, the one before then being untouched."""
+    """Replace the manifest at once. Raises OSError, the one before then being untouched.
+
+    Raises NotFlushed where the new one is in place, but the folder could not be flushed: after a power cut it may be
+    either of the two.
+    """
     aside = folder / (NAME + ".new")
     with open(aside, "wb") as file:
         file.write(manifest.encode())
@@ -187,4 +195,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
         os.fsync(file.fileno())
     sync_folder(folder)  # the segments' names first
     os.replace(aside, folder / NAME)
-    sync_folder(folder)
+    try:
+        sync_folder(folder)
+    except OSError as error:
+        raise NotFlushed(error.errno, error.strerror) from error

@@ -24,6 +24,7 @@ from pnv_core.maps.manifest import (
     NAME,
     SEGMENT_NAME,
     Manifest,
+    NotFlushed,
     Runs,
     Segment,
     Session,
@@ -179,7 +180,11 @@ class MapStore:
             sessions_of(refs.values()),
             tuple(sorted((*kept, *written), key=_first_id)),
         )
-        commit(self.path, manifest, written)
+        try:
+            commit(self.path, manifest, written)
+        except NotFlushed:
+            self._known, self._lineage = manifest, snapshot.lineage  # it is in place, and this run goes on with it
+            raise
         new = unsaved - len(unreadable)
         return manifest, SaveReport(self.path, len(refs), new, sum(s.bytes for s in written), len(unreadable))
 
@@ -266,9 +271,14 @@ def _closed(writer: SegmentWriter) -> Segment:
 
 
 def commit(folder: Path, manifest: Manifest, written: list[Segment]) -> None:
-    """Make the manifest the map, then remove what it does not name. Raises OSError, the map being as before."""
+    """Make the manifest the map, then remove what it does not name. Raises OSError, the map being as before.
+
+    Raises NotFlushed where it is the map, but may not be after a power cut: the files of both states stay.
+    """
     try:
         write_manifest(folder, manifest)
+    except NotFlushed:
+        raise
     except OSError:
         _remove(folder, [NAME + ".new", *(s.file for s in written)])
         raise
