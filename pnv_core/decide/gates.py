@@ -24,8 +24,9 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         return replace(closure, reason=Reason.LOW_TEXTURE)
     wanted = config.consistency
     path = sequence.path(closure, window_of(wanted))
-    agreed = confirmed(path, wanted) and closure.score >= PRIOR
-    belief = max(closure.score, path.belief) if agreed else closure.score
+    alone = wanted <= 1  # nothing beyond the closure itself is asked for
+    agreed = alone or (confirmed(path, wanted) and closure.score >= PRIOR)
+    belief = closure.score if alone or not agreed else max(closure.score, path.belief)
     if belief < config.accept_score:
         return replace(closure, reason=Reason.LOW_SCORE)
     unexamined = evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE
@@ -35,7 +36,7 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         return replace(closure, reason=Reason.ODOMETRY)
     if not agreed and closure.score < config.sure_score:
         return replace(closure, reason=Reason.UNCONFIRMED)
-    if wanted > 1 and ambiguous(evidence):
+    if not alone and ambiguous(evidence):
         longer = sequence.path(closure, window_of(wanted + DOUBT))
         if not confirmed(longer, wanted + DOUBT):
             return replace(closure, reason=Reason.AMBIGUOUS)

@@ -162,7 +162,7 @@ def test_a_decompression_bomb_is_refused_from_its_header(monkeypatch):
     huge_jpeg = bytearray(encoded(".jpg", photo()))
     at = huge_jpeg.index(b"\xff\xc0")
     huge_jpeg[at + 5 : at + 9] = struct.pack(">HH", 65500, 65500)
-    with pytest.raises(ImageError, match="too many pixels; allowed"):
+    with pytest.raises(ImageError, match=r"4290250000 pixels; allowed"):
         rgb(compressed(bytes(huge_jpeg)))
 
 

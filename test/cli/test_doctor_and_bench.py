@@ -83,7 +83,7 @@ def test_bench_prints_a_table_and_settings(capsys: pytest.CaptureFixture[str]) -
     ]
     assert main(["bench", *given, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert {m["scorer"] for m in report["measured"]} == {"ransac", "rapid"}
+    assert {m["scorer"] for m in report["measured"]} == {"usac", "rapid"}
     assert report["proposal"]["candidates"] == 50
     assert main(["bench", "--rate", "0"]) == 2
     assert "--rate 0 is out of range" in capsys.readouterr().err

@@ -110,7 +110,7 @@ def test_the_rotation_a_camera_noted_is_applied_by_every_reader(orientation, rea
 @pytest.mark.parametrize("reader", READERS)
 def test_a_bomb_is_refused_by_every_reader_in_one_line(reader, tmp_path):
     Image.new("1", (40000, 40000)).save(tmp_path / "huge.png")
-    with pytest.raises(ImageError, match="too many pixels; allowed: up to 67 megapixels") as refusal:
+    with pytest.raises(ImageError, match=r"1600000000 pixels; allowed: up to 67 megapixels") as refusal:
         READERS[reader](tmp_path / "huge.png")
     assert "\n" not in str(refusal.value)
 

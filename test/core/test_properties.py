@@ -103,7 +103,7 @@ def test_spatial_scores_of_any_matches_lie_between_0_and_1(seed, count, stride):
     assert inlier.shape == (count,)
 
 
-@pytest.mark.parametrize("scorer", ["ransac", "rapid"])
+@pytest.mark.parametrize("scorer", ["usac", "ransac", "rapid"])
 def test_an_image_scores_1_against_itself_and_more_than_against_another(scorer):
     describer = small_describer(scorer=scorer)
     one, other = describer.describe(noise_image(1)), describer.describe(noise_image(2))
@@ -112,7 +112,7 @@ def test_an_image_scores_1_against_itself_and_more_than_against_another(scorer):
     assert reranker.score(one, other).score < 0.5
 
 
-@pytest.mark.parametrize("scorer", ["ransac", "rapid"])
+@pytest.mark.parametrize("scorer", ["usac", "ransac", "rapid"])
 @pytest.mark.parametrize("level", [0, 128, 255])
 def test_a_blank_image_gives_finite_numbers_and_no_texture(scorer, level):
     describer = small_describer(scorer=scorer)

@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pnv_core.config import Config
 from pnv_core.database import KeyframeDatabase
 from pnv_core.decide.consistency import SequenceMemory, confirmed, window_of
-from pnv_core.types import ImageRef, LoopClosure
+from pnv_core.decide.gates import decided
+from pnv_core.types import ImageRef, LoopClosure, Reason
 from test.database.synthetic import drive
 
 WANTED = 3
@@ -174,3 +176,13 @@ def test_a_better_score_anywhere_on_a_way_never_lowers_the_belief(scores, better
             memory.remember("front", [last], window_of(5))
         beliefs.append(memory.path(last, window_of(5)).belief)
     assert beliefs[1] >= beliefs[0]
+
+
+def test_without_consistency_a_closure_of_any_accepted_score_stands_alone():
+    ref = ImageRef(0, 0, "front")
+    sequence = SequenceMemory()
+    weak = LoopClosure(ImageRef(1, 10**11, "front"), ref, 0.02, 0.5, 0.1, 5, False)
+    for wanted in (0, 1):
+        config = Config(accept_score=0.01, consistency=wanted, verify=0)
+        assert decided(weak, config, sequence).accepted
+    assert decided(weak, Config(accept_score=0.01, consistency=3, verify=0), sequence).reason is Reason.UNCONFIRMED
