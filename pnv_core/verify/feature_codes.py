@@ -3,8 +3,7 @@
     "PNVF", N u16, height / width of the picture f32, points (N, 2) u16 in 1/16384 of its width, then zlib of the
     RootSIFT descriptors (N, 128): four bits each of their square roots, which spreads the many small values.
 
-Little-endian. Inliers of 44 rendered pairs of one place: 80 on average with these codes, 83 with the features of the
-pictures; 26 kB where the picture takes 15 (docs/fleet.md).
+Little-endian. `test/verify/test_feature_codes.py` bounds what the codes cost in inliers.
 """
 
 import struct
