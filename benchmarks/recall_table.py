@@ -185,7 +185,7 @@ def with_default(describer: Describer, known: RecallSet, depth: int) -> list[tup
     for row, query in enumerate(queries):
         head = [int(c) for c in order[row, :depth] if known.counted[row, c]]
         found = [(ImageRef(c, 0, ""), float(query.global_vector @ references[c].global_vector)) for c in head]
-        judged = judge.judged(ImageRef(-1, 0, ""), query, 1.0, found, [references[c] for c in head], config)
+        judged = judge.judge(ImageRef(-1, 0, ""), query, 1.0, found, [references[c] for c in head], config)
         better[row, : len(head)] = [closure.match.id for closure in judged]
         spatial[row, : len(head)] = [c.match.id for c in sorted(judged, key=lambda c: -c.spatial)]
     orders = {"global": order, "patches": spatial, "re-ranked": better}

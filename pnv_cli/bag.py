@@ -133,7 +133,7 @@ def _fill(
         closed += len(accepted)
         if accepted:
             write("/loop_closures", recorded_ns, closures_to_message(accepted, cameras))
-            pose = poses.of(accepted[0])
+            pose = poses.estimate(accepted[0])
             if pose is not None and pose.metric:
                 write(f"{NODE}/relative_pose", recorded_ns, relative_pose_to_message(accepted[0], pose))
     if not frames:

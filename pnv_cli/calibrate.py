@@ -40,9 +40,9 @@ def run(args: argparse.Namespace) -> int:
     from pnv_core.describe.describer import describer_from
     from pnv_core.describe.model_files import save_model
     from pnv_lab.calibrating import (
-        calibrated,
-        cross_checked,
-        gathered,
+        calibrate,
+        cross_check,
+        gather_examples,
         truth_of_matches,
         truth_of_poses,
         truth_of_time,
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
         truth = truth_of_time(args.near_s, args.far_s)
     # from time, the neighbours are what is true: they must be candidates
     recent_s = 0.0 if by_time else describer.config.exclude_recent_s
-    found = gathered(describer, source_of(args).frames, truth, recent_s)
+    found = gather_examples(describer, source_of(args).frames, truth, recent_s)
     if by_time:
         found = without_unlabelled_loops(found)
     true, false = int(found.true.sum()), int((~found.true).sum())
@@ -73,10 +73,10 @@ def run(args: argparse.Namespace) -> int:
             f"{true} true and {false} false candidates found; allowed: at least {_LEAST} of each "
             "(a longer sequence, other --near-s and --far-s, or --poses)"
         )
-    calibration = calibrated(found, describer, f"pnv calibrate, {true} true and {false} false candidates")
+    calibration = calibrate(found, describer, f"pnv calibrate, {true} true and {false} false candidates")
     save_model(describer.model.with_info(calibration=calibration.to_json()), output)
     print(f"{true} true and {false} false candidates -> {output}")
-    checked = cross_checked(found, describer)
+    checked = cross_check(found, describer)
     if checked is not None:
         diagram = checked.diagram
         print("score  share true  candidates   (each quarter of the sequence judged by the other three)")

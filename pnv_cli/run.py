@@ -289,7 +289,7 @@ def _export(
                 x, y, z = map(float, pose.position)
                 recognizer.odometry.add(ref.stamp_ns, x, y, z)  # the run decided without it
             measured = RelativePoses(recognizer, cameras)
-            closures = [(c, measured.of(c)) for c in accepted]
+            closures = [(c, measured.estimate(c)) for c in accepted]
             texts[targets.g2o] = graph_to_g2o({ref.id: pose for ref, pose in nodes.items()}, closures)
     for path, text in texts.items():
         with atomic_write(path) as file:

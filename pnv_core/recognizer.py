@@ -72,7 +72,7 @@ class PlaceRecognizer:
             candidates = [(ref, similarity) for ref, similarity in candidates if ref.id not in gone]
             known = list(stored.values())
             query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
-            closures = self.judge.judged(query, descriptor, predecessor, candidates, known, self.config)
+            closures = self.judge.judge(query, descriptor, predecessor, candidates, known, self.config)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)

@@ -44,7 +44,7 @@ class Answers:
         known = [hit for hit in hits if hit.place.key in descriptors]
         candidates = [(hit.place.ref, hit.similarity) for hit in known]
         references = [descriptors[hit.place.key] for hit in known]
-        closures = self._judge.judged(query.ref, descriptor, query.predecessor, candidates, references, self.config)
+        closures = self._judge.judge(query.ref, descriptor, query.predecessor, candidates, references, self.config)
         self._sequence.remember(query.ref.camera, closures, window_of(self.config.consistency + DOUBT))
         return [decided(closure, self.config, self._sequence) for closure in closures]
 

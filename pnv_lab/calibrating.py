@@ -28,7 +28,9 @@ class Examples:
     true: NDArray[np.bool_]
 
 
-def gathered(describer: Describer, frames: Iterable[tuple[str, Frame]], truth: Truth, recent_s: float) -> Examples:
+def gather_examples(
+    describer: Describer, frames: Iterable[tuple[str, Frame]], truth: Truth, recent_s: float
+) -> Examples:
     """Every candidate of a sequence whose truth is known. `recent_s` is the exclusion window while gathering."""
     config = describer.config
     config = config.replace(exclude_recent_s=recent_s, consistency=0, verify=min(100, config.candidates))
@@ -46,7 +48,7 @@ def gathered(describer: Describer, frames: Iterable[tuple[str, Frame]], truth: T
     return Examples(evidence, np.array(true, bool))
 
 
-def calibrated(examples: Examples, describer: Describer, source: str) -> Calibration:
+def calibrate(examples: Examples, describer: Describer, source: str) -> Calibration:
     """The calibration of the examples; true and false ones keep their numbers. Raises ModelError for one class only."""
     pairs = list(zip(examples.evidence, (bool(t) for t in examples.true), strict=True))
     return fit_calibration(pairs, np.ones(len(pairs)), describer.config, source)
@@ -67,7 +69,7 @@ class Checked:
         return threshold_for_precision(self.scores, self.true, precision)
 
 
-def cross_checked(examples: Examples, describer: Describer, parts: int = 4) -> Checked | None:
+def cross_check(examples: Examples, describer: Describer, parts: int = 4) -> Checked | None:
     """Every part of the sequence in time judged by a fit to the others; None where a part leaves one class only."""
     count = len(examples.true)
     part = np.arange(count) * parts // max(count, 1)
@@ -77,7 +79,7 @@ def cross_checked(examples: Examples, describer: Describer, parts: int = 4) -> C
         rest = Examples([e for e, u in zip(examples.evidence, use, strict=True) if u], examples.true[use])
         if rest.true.all() or not rest.true.any():
             return None
-        fitted = calibrated(rest, describer, "")
+        fitted = calibrate(rest, describer, "")
         for i in np.flatnonzero(~use):
             scores[i] = fitted.probability(examples.evidence[i])
     return Checked(scores, examples.true)

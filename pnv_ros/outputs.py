@@ -98,7 +98,7 @@ class Outputs:
         """The best closure's pose, where somebody wants it, by itself and in the typed twin."""
         heard = self._relative_pose.get_subscription_count()
         heard += self._typed.get_subscription_count() if self._typed is not None else 0
-        pose = self._poses.of(accepted[0]) if self._poses is not None and heard else None
+        pose = self._poses.estimate(accepted[0]) if self._poses is not None and heard else None
         if pose is not None and pose.metric:
             self._relative_pose.publish(relative_pose_to_message(accepted[0], pose))
         if self._typed is not None:

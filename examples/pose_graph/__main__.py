@@ -86,7 +86,7 @@ def recorded(walk: Walk, odometry: Array) -> Recording:
         for closure in recognizer.process(frame):
             if closure.accepted:
                 recording.closures.append(replace(closure, matches=()))
-                pose = relative.of(closure)
+                pose = relative.estimate(closure)
                 if pose is not None and pose.covariance is not None:
                     camera = np.eye(4)
                     camera[:3, :3], camera[:3, 3] = pose.rotation, pose.translation

@@ -26,7 +26,7 @@ class Judge:
         self.verifier = VERIFIERS.make(config.verifier)
         self.calibration: Calibration = calibration_for(stored_calibration, config)
 
-    def judged(
+    def judge(
         self,
         query: ImageRef,
         descriptor: PlaceDescriptor,

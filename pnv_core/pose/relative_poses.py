@@ -31,7 +31,7 @@ class RelativePoses:
         self.cameras = cameras if cameras is not None else {}
         self.offsets: dict[str, tuple[float, float, float]] = {}
 
-    def of(self, closure: LoopClosure, depth: NDArray[np.floating] | None = None) -> RelativePose | None:
+    def estimate(self, closure: LoopClosure, depth: NDArray[np.floating] | None = None) -> RelativePose | None:
         """The query's camera in the frame of the match's. `depth` (h, w) in metres belongs to the query's image.
 
         None for an uncalibrated camera, keyframes without a picture, and where too few points agree. Without depth,

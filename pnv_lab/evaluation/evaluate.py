@@ -15,7 +15,7 @@ from pnv_core.describe.describer import describer_from
 from pnv_lab.evaluation.datasets.dataset import Dataset
 from pnv_lab.evaluation.datasets.pose_truth import pose_errors
 from pnv_lab.evaluation.dense_vlad import fitted_dense_vlad
-from pnv_lab.evaluation.extraction import Describing, Extraction, Progress, leading
+from pnv_lab.evaluation.extraction import CachedExtraction, Extraction, Progress, leading
 from pnv_lab.evaluation.methods import Method
 from pnv_lab.evaluation.metrics import Decisions, first_hits, unique_groups
 from pnv_lab.evaluation.ranking import Ranking, rerank, retrieve
@@ -63,7 +63,7 @@ class Evaluation:
         self.workers = workers
         self.dask = dask
         self.depth = max(depth, config.candidates)
-        self._ready: dict[Extraction, Describing] = {}
+        self._ready: dict[Extraction, CachedExtraction] = {}
         self._completed: dict[Config, Config] = {}
         self._sizes: dict[Config, set[int]] = {}  # patch sizes described together, for methods that share features
 
@@ -103,7 +103,7 @@ class Evaluation:
             self._reference_bytes(method, features, keys[id(features)][0], dataset.references, references),
         )
 
-    def describing(self, dataset: Dataset, method: Method, kind: str) -> Describing:
+    def describing(self, dataset: Dataset, method: Method, kind: str) -> CachedExtraction:
         """The ready extraction of a kind of features for a method."""
         config = method.config(self.config)
         if kind == "densevlad":
@@ -119,7 +119,7 @@ class Evaluation:
                 config = config.replace(patch_sizes=wanted, patch_strides=own, patch_weights=())
         extraction = Extraction(kind, config)
         if extraction not in self._ready:
-            self._ready[extraction] = Describing(extraction, self.cache, self.config.memory_budget_mb / _STORES)
+            self._ready[extraction] = CachedExtraction(extraction, self.cache, self.config.memory_budget_mb / _STORES)
         return self._ready[extraction]
 
     def completed(self, config: Config) -> Config:
@@ -137,13 +137,13 @@ class Evaluation:
             vectors.append(retrieval.vectors(retrieval.describe_all(chosen, self.progress), chosen))
         return vectors[0] @ vectors[1].T
 
-    def _described(self, describing: Describing, dataset: Dataset, part: str) -> list[str]:
+    def _described(self, describing: CachedExtraction, dataset: Dataset, part: str) -> list[str]:
         """The keys of the references or queries, all of them described."""
         paths = dataset.references if part == "references" else dataset.queries
         what = f"{dataset.name}, {describing.extraction.kind}, {part}"
         return describing.describe_all(paths, self.progress, self.workers, self.dask, what)
 
-    def _shared_projection(self, describing: Describing) -> bool:
+    def _shared_projection(self, describing: CachedExtraction) -> bool:
         describer = getattr(describing.extractor, "describer", None)
         return describer is None or not describer.model.has("patch_projection")
 
@@ -157,7 +157,7 @@ class Evaluation:
         self,
         dataset: Dataset,
         method: Method,
-        features: Describing,
+        features: CachedExtraction,
         keys: tuple[list[str], list[str]],
         rankings: Sequence[Ranking],
     ) -> Iterator[Ranking]:
@@ -185,7 +185,7 @@ class Evaluation:
             done = _in_order(pool, one, len(rankings), 2 * self.workers)
             yield from self.progress(done, len(rankings), f"{dataset.name}, {method.name}")
 
-    def _seconds(self, describing: Describing, keys: Sequence[str], paths: Sequence[Path]) -> float:
+    def _seconds(self, describing: CachedExtraction, keys: Sequence[str], paths: Sequence[Path]) -> float:
         """Median seconds of describing an image, as measured when it was described."""
         sample = range(0, len(keys), max(1, len(keys) // 50))
         return float(np.median([describing.record(keys[i], paths[i])["seconds"][0] for i in sample]))
@@ -193,7 +193,7 @@ class Evaluation:
     def _reference_bytes(
         self,
         method: Method,
-        features: Describing,
+        features: CachedExtraction,
         keys: Sequence[str],
         paths: Sequence[Path],
         vectors: NDArray[np.float32],

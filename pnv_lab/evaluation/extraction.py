@@ -1,4 +1,4 @@
-"""Describing the images of a data set once: cached, resumable, in one process or many.
+"""CachedExtraction the images of a data set once: cached, resumable, in one process or many.
 
 What is stored of an image depends on the bytes of the image and on the Extraction alone, so that an interrupted run,
 several workers or several machines give the same files.
@@ -101,7 +101,7 @@ def leading(vectors: NDArray, dim: int | None) -> NDArray[np.float32]:
     return values / np.maximum(norm, 1e-12)
 
 
-class Describing:
+class CachedExtraction:
     """An Extraction made ready: its extractor and its place in the cache."""
 
     def __init__(self, extraction: Extraction, cache: Path, memory_mb: float = 256.0) -> None:

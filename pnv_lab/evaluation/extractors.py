@@ -114,7 +114,7 @@ class DenseVLAD:
             return {"global": self.model.global_projection(vlad).numpy()}
 
 
-class LocalFeatures:
+class LocalFeatureExtractor:
     """SIFT or LightGlue's features of the image at the size the other methods see."""
 
     def __init__(self, kind: str, config: Config) -> None:
@@ -136,8 +136,8 @@ KINDS: dict[str, Callable[[Config], Extractor]] = {
     "maximum": partial(PooledPatches, "maximum"),
     "gem": GeM,
     "densevlad": DenseVLAD,
-    "sift": partial(LocalFeatures, "sift"),
-    **{kind: partial(LocalFeatures, kind) for kind in LIGHTGLUE_KINDS},
+    "sift": partial(LocalFeatureExtractor, "sift"),
+    **{kind: partial(LocalFeatureExtractor, kind) for kind in LIGHTGLUE_KINDS},
 }
 
 

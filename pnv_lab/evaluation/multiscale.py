@@ -31,10 +31,10 @@ def cross_size_score(query: PlaceDescriptor, reference: PlaceDescriptor) -> floa
 def _joint(query: PlaceDescriptor, target: NDArray, source: NDArray) -> float:
     patches = sum(g.rows * g.cols for g in query.patches)
     tolerance = max(g.cell * g.stride for g in query.patches) * RANSAC_TOLERANCE_CELLS
-    return homography_inliers(source.astype(np.float32), target.astype(np.float32), tolerance) / patches
+    return count_homography_inliers(source.astype(np.float32), target.astype(np.float32), tolerance) / patches
 
 
-def homography_inliers(source: _Points, target: _Points, tolerance: float) -> int:
+def count_homography_inliers(source: _Points, target: _Points, tolerance: float) -> int:
     """How many of the (M, 2) point pairs one homography explains within `tolerance` pixels; 0 below four pairs."""
     if len(source) < MIN_MATCHES:
         return 0

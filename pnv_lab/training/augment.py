@@ -27,7 +27,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class Camera:
+class SampledCamera:
     """Where a view of a panorama looks, in radians."""
 
     yaw: float
@@ -69,7 +69,7 @@ def flat_view(
 
 
 def panorama_view(
-    source: Pixels, size: tuple[int, int], camera: Camera, strength: float, mirror: bool, rng: Rng
+    source: Pixels, size: tuple[int, int], camera: SampledCamera, strength: float, mirror: bool, rng: Rng
 ) -> View:
     """A perspective view of an equirectangular panorama, with the same parallax-like displacement."""
     width, height = size
@@ -112,7 +112,7 @@ def relight(pixels: Pixels, strength: float, rng: Rng, occluder: Pixels | None =
     elif rng.random() < 0.2 * strength:
         image = _motion_blur(image, rng)
     if rng.random() < 0.15 * strength:
-        image = thumbnail(image, int(rng.integers(72, 180)))
+        image = small_picture(image, int(rng.integers(72, 180)))
     if rng.random() < 0.35 * strength:
         image = _noisy(image, rng.uniform(3, 16), rng)
     if rng.random() < 0.25 * strength:
@@ -237,7 +237,7 @@ def _motion_blur(image: Pixels, rng: Rng) -> Pixels:
     return cv2.filter2D(image, -1, kernel / kernel.sum())
 
 
-def thumbnail(image: Pixels, small_width: int) -> Pixels:
+def small_picture(image: Pixels, small_width: int) -> Pixels:
     """As if it had been stored far too small."""
     height, width = image.shape[:2]
     small = cv2.resize(image, (small_width, max(1, small_width * height // width)), interpolation=cv2.INTER_AREA)

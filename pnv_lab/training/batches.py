@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pnv_core.describe.trunks.trunk import Trunk
-from pnv_lab.training.augment import Camera, View, flat_view, panorama_view, relight, thumbnail
+from pnv_lab.training.augment import SampledCamera, View, flat_view, panorama_view, relight, small_picture
 from pnv_lab.training.sources import DEFAULT_RULE, RULES, PlaceImage, relation
 
 PANORAMA_WEIGHT = 36.0  # a panorama holds this many times more views than a photograph
@@ -108,7 +108,7 @@ class PlaceBatches:
         strengths = [self.options.strength * (1.0 if v % self.options.views else 0.5) for v in range(len(origins))]
         views = [self._view(o, size, s, rng) for o, s in zip(origins, strengths, strict=True)]
         if small:
-            views = [replace(v, pixels=thumbnail(v.pixels, int(rng.integers(*_SMALL_WIDTH)))) for v in views]
+            views = [replace(v, pixels=small_picture(v.pixels, int(rng.integers(*_SMALL_WIDTH)))) for v in views]
         return origins, views
 
     def _places(self, rng: np.random.Generator) -> list[Origin]:
@@ -159,7 +159,7 @@ class PlaceBatches:
             reach = np.tan(np.deg2rad(rng.uniform(75, 92)) / 2) / advance
             field_of_view = 2 * float(np.arctan(reach))
             pitch, roll = rng.normal(0, 0.12) * strength, rng.normal(0, 0.06) * strength
-            camera = Camera(origin.yaw, pitch, roll, field_of_view)
+            camera = SampledCamera(origin.yaw, pitch, roll, field_of_view)
             return panorama_view(origin.image.rgb, size, camera, strength, origin.mirror, rng)
         return flat_view(origin.image.rgb, size, strength, origin.mirror, rng, max(advance, 1.0))
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pnv_core.describe.torch_model import TorchModel
-from pnv_lab.training.augment import Camera, flat_view, panorama_view, relight
+from pnv_lab.training.augment import SampledCamera, flat_view, panorama_view, relight
 from pnv_lab.training.sources import PlaceImage, relation
 
 YAWS = 8  # reference views of a panorama
@@ -41,8 +41,8 @@ def synthetic_queries(
         origins.append((source, 0.0))
     for source in (i for i in images if i.panorama):
         for yaw in np.arange(YAWS) * 2 * np.pi / YAWS:
-            still = Camera(float(yaw), 0.0, 0.0, float(np.deg2rad(75)))
-            moved = Camera(
+            still = SampledCamera(float(yaw), 0.0, 0.0, float(np.deg2rad(75)))
+            moved = SampledCamera(
                 float(yaw + rng.uniform(-0.4, 0.4)),
                 rng.normal(0, 0.1),
                 rng.normal(0, 0.05),

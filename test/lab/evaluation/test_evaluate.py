@@ -22,7 +22,7 @@ from pnv_lab.evaluation.datasets import open_dataset
 from pnv_lab.evaluation.datasets.dataset import Dataset
 from pnv_lab.evaluation.datasets.pairs import pairs_dataset
 from pnv_lab.evaluation.evaluate import Evaluation, MethodResult
-from pnv_lab.evaluation.extraction import Describing, Extraction, descriptor_of, descriptor_record, leading
+from pnv_lab.evaluation.extraction import CachedExtraction, Extraction, descriptor_of, descriptor_record, leading
 from pnv_lab.evaluation.grid import grid_search
 from pnv_lab.evaluation.local_features import ratio_matches
 from pnv_lab.evaluation.methods import GROUPS, parse_method, parse_methods
@@ -107,8 +107,8 @@ def test_an_interrupted_evaluation_goes_on_to_the_same_result(dataset: Dataset, 
 
 def test_a_changed_image_or_setting_is_described_anew(root: Path, tmp_path: Path) -> None:
     path = write(tmp_path / "a.png", place(1))
-    first = Describing(Extraction("patchnetvlad", SMALL), tmp_path / "cache")
-    other = Describing(Extraction("patchnetvlad", SMALL.replace(patch_sizes=(2, 4))), tmp_path / "cache")
+    first = CachedExtraction(Extraction("patchnetvlad", SMALL), tmp_path / "cache")
+    other = CachedExtraction(Extraction("patchnetvlad", SMALL.replace(patch_sizes=(2, 4))), tmp_path / "cache")
     assert first.store.folder != other.store.folder
     (before,) = first.describe_all([path], silent)
     write(path, place(2))
@@ -139,7 +139,7 @@ _OTHER = {
 
 def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_path: Path) -> None:
     first = Extraction("patchnetvlad", SMALL)
-    folder = Describing(first, tmp_path).store.folder
+    folder = CachedExtraction(first, tmp_path).store.folder
     told = []
     for name, declared in settings_of(Config).items():
         if name in ("weights", "threads"):  # the model's content counts; any number of threads describes alike
@@ -150,7 +150,7 @@ def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_p
         second = Extraction("patchnetvlad", SMALL.replace(**{name: other}))
         if second != first:
             told.append(name)
-            assert Describing(second, tmp_path).store.folder != folder, name
+            assert CachedExtraction(second, tmp_path).store.folder != folder, name
     assert {"trunk_precision", "backend", "patch_sizes", "image_width", "patch_precision"} <= set(told)
     assert not {"scale_weight", "accept_score", "memory_budget_mb", "candidates"} & set(told)  # described once for all
 
@@ -160,8 +160,8 @@ def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_p
 def test_two_workers_describe_as_one_process_does(how: str, dataset: Dataset, tmp_path: Path) -> None:
     if how == "dask":
         pytest.importorskip("distributed")
-    one = Describing(Extraction("patchnetvlad", SMALL), tmp_path / "one")
-    two = Describing(Extraction("patchnetvlad", SMALL), tmp_path / "two")
+    one = CachedExtraction(Extraction("patchnetvlad", SMALL), tmp_path / "one")
+    two = CachedExtraction(Extraction("patchnetvlad", SMALL), tmp_path / "two")
     keys = one.describe_all(dataset.references, silent)
     assert two.describe_all(dataset.references, silent, workers=2, dask="local" if how == "dask" else None) == keys
     for key in keys:
@@ -174,7 +174,7 @@ def test_two_workers_describe_as_one_process_does(how: str, dataset: Dataset, tm
 
 
 def test_memory_stays_bounded(dataset: Dataset, tmp_path: Path) -> None:
-    describing = Describing(Extraction("patchnetvlad", SMALL), tmp_path, memory_mb=0.2)
+    describing = CachedExtraction(Extraction("patchnetvlad", SMALL), tmp_path, memory_mb=0.2)
     keys = describing.describe_all(dataset.references, silent)
     largest = 0
     for key, path in zip(keys, dataset.references, strict=True):

@@ -11,7 +11,7 @@ from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.errors import ModelError
 from pnv_core.networks.layers import Conv
 from pnv_lab.fit import FitOptions, learned_whitening
-from pnv_lab.training.augment import Camera, flat_view, panorama_view, relight
+from pnv_lab.training.augment import SampledCamera, flat_view, panorama_view, relight
 from pnv_lab.training.batches import BatchOptions, PlaceBatches
 from pnv_lab.training.initial import imagenet_trunk, initial_model
 from pnv_lab.training.pool import FeaturePool
@@ -139,7 +139,7 @@ def test_two_views_of_a_panorama_agree_on_directions():
     panorama = np.zeros((200, 400, 3), np.uint8)
     panorama[..., 0] = np.linspace(0, 255, 400)[None]
     rng = np.random.default_rng(0)
-    view = panorama_view(panorama, (320, 240), Camera(0.4, 0.0, 0.0, 1.2), 0.0, False, rng)
+    view = panorama_view(panorama, (320, 240), SampledCamera(0.4, 0.0, 0.0, 1.2), 0.0, False, rng)
     yaw = np.arctan2(view.coordinates[..., 0], view.coordinates[..., 2])
     shown = (view.pixels[7::16, 7::16, 0] / 255 - 0.5) * 2 * np.pi
     assert np.abs(yaw - shown).max() < 0.06
