@@ -8,7 +8,7 @@ from pnv_core.decide.consistency import DOUBT, PRIOR, SequenceMemory, confirmed,
 from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
-_AGREE = 0.55  # share of the matched local features; look-alike walls have less (median 0.45), true revisits 0.6 to 0.9
+_AGREE = 0.6  # share of the matched local features; look-alike walls have less (median 0.45), true revisits 0.6 to 0.9
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
