@@ -1,5 +1,6 @@
-"""The fleet's memory, measured: python -m benchmarks.fleet scale | kills | cut
+"""The fleet's memory, measured: python -m benchmarks.fleet robots | scale | kills | cut
 
+robots    two robots that share places against one that drives both their laps: precision and recall
 scale     insert rate, query latency, recall@10 against exact search, at so many keyframes (--sizes)
 kills     robot and store killed at random moments (--kills): nothing acknowledged is lost, nothing is stored twice
 cut       the store is away for a while (--seconds) in a walk: local closures and time of a frame as without a fleet,
@@ -267,9 +268,9 @@ def cut(seconds: float) -> int:
                     fleet.offer(query, both[0].database.first().stamp_ns)  # type: ignore[union-attr]
                 times[i].append(time.perf_counter() - begin)
                 sent[i].append(np.array(closures_to_message(found, ("camera",)).data).tobytes())
-            if number < len(frames) - 20:
-                pause = seconds / (len(frames) - 20) - (time.monotonic() - start) / (number + 1)
-                time.sleep(max(0.0, pause))
+            if number < len(frames) - 20:  # as many frames as there are, spread over the whole of the cut
+                due = start + seconds * (number + 1) / (len(frames) - 20)
+                time.sleep(max(0.0, due - time.monotonic()))
             elif server.process.poll() is not None:
                 waiting = fleet.status().waiting
                 print(f"the store is back after {time.monotonic() - start:.0f} s; {waiting} keyframes wait")
@@ -295,6 +296,9 @@ def main() -> int:
     sized.add_argument("--queries", type=int, default=200)
     actions.add_parser("kills").add_argument("--kills", type=int, default=100)
     actions.add_parser("cut").add_argument("--seconds", type=float, default=600.0)
+    pair = actions.add_parser("robots")
+    pair.add_argument("names", nargs="*")
+    pair.add_argument("--shared", type=Path, default=Path("../shared"))
     child = actions.add_parser("robot")
     child.add_argument("uri")
     child.add_argument("folder", type=Path)
@@ -304,6 +308,10 @@ def main() -> int:
         return kills(args.kills)
     if args.action == "cut":
         return cut(args.seconds)
+    if args.action == "robots":
+        from benchmarks.fleet_robots import SETS, robots
+
+        return robots(args.names or list(SETS), args.shared)
     if args.action == "robot":
         robot(args.uri, args.folder)
     elif args.action == "scale":
