@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,33 +179,37 @@ def _seen(number: int) -> PlaceDescriptor:
 
 
 def robot(uri: str, folder: Path) -> None:
-    """Keeps a keyframe every 10 ms and prints its number once it is in the outbox; until it is killed."""
-    from pnv_fleet.fleet import Fleet, Options
-
-    config = Config.make(patch_sizes=(2,), patch_strides=(1,), patch_weights=(1.0,), verify=0, scorer="rapid")
-    options = Options(uri, "robot", 200.0, folder / "outbox", 100.0, 0.0, 1.0, False)
-    fleet = Fleet(options, config, "7" * 64, _like(), None, lambda closures: None, lambda line: None)
+    """Keeps a keyframe every tenth of a second and prints its number once it is in the outbox; until it is killed."""
+    fleet = _robot(uri, folder)
     number = int((folder / "next").read_text()) if (folder / "next").exists() else 0
     while True:
         query = Query(ImageRef(number, (number + 1) * 10**9, "camera"), _seen(number), 1.0)
         fleet._take(query, 0, None, time.monotonic())
         print(number, flush=True)
         number += 1
-        time.sleep(0.01)
+        time.sleep(0.1)
 
 
-def kills(count: int) -> int:
-    """0 where nothing was lost or doubled."""
-    from pnv_fleet.outbox import Outbox
+def _robot(uri: str, folder: Path) -> Any:
+    from pnv_fleet.fleet import Fleet, Options
+
+    config = Config.make(patch_sizes=(2,), patch_strides=(1,), patch_weights=(1.0,), verify=0, scorer="rapid")
+    options = Options(uri, "robot", 200.0, folder / "outbox", 100.0, 0.0, 1.0, False)
+    return Fleet(options, config, "7" * 64, _like(), None, lambda closures: None, lambda line: None)
+
+
+def kills(count: int, longest_s: float) -> int:
+    """0 where nothing was lost or doubled, and everything that waited was stored in the end."""
     from pnv_fleet.store import Access, PlaceStore
 
     rng = np.random.default_rng(0)
     kept: set[int] = set()
+    killed = {"robot": 0, "store": 0}
     with served() as server:
         folder = server.folder.parent
         out = folder / "printed"
         child: subprocess.Popen | None = None
-        for kill in range(count):
+        for _ in range(count):
             if child is None:
                 kept |= _printed(out)
                 (folder / "next").write_text(str(max(kept, default=-1) + 2))  # the last line may have been cut
@@ -213,11 +218,13 @@ def kills(count: int) -> int:
                 end = time.monotonic() + _START_S
                 while not _printed(out) and time.monotonic() < end:
                     time.sleep(0.02)
-            time.sleep(float(rng.uniform(0.05, 1.5)))
-            if kill % 2:
+            time.sleep(float(rng.uniform(0.05, longest_s)))
+            if rng.random() < 0.5:
+                killed["store"] += 1
                 server.kill()
                 server.start()
             else:
+                killed["robot"] += 1
                 child.kill()
                 child.wait()
                 child = None
@@ -226,14 +233,20 @@ def kills(count: int) -> int:
             child.wait()
         kept |= _printed(out)
         server.wait()
-        waiting = Outbox(folder / "outbox", 100.0)
-        left = {w.place.keyframe for w in waiting.oldest(10**6, 10**9)}
         store = PlaceStore(server.uri, "7" * 64, Access(), timeout_s=60.0)
+        last = _robot(server.uri, folder)
+        waiting, before = len(last._outbox), store.count()
+        end = time.monotonic() + 10 * _START_S
+        while len(last._outbox) and time.monotonic() < end:
+            time.sleep(0.1)
+        left = {w.place.keyframe for w in last._outbox.oldest(10**6, 10**9)}
+        last.close()
         stored = [place.keyframe for place in store.scan() if not isinstance(place, str)]
         lost, doubled = kept - left - set(stored), len(stored) - len(set(stored))
-        print(f"{count} kills, half of them of the store: {len(kept)} keyframes acknowledged by the outbox, "
-              f"{len(stored)} in the store, {len(left)} still wait; lost {len(lost)}, doubled {doubled}")  # fmt: skip
-        return int(bool(lost) or doubled > 0)
+        print(f"{killed['robot']} kills of the robot, {killed['store']} of the store: {len(kept)} keyframes "
+              f"acknowledged by the outbox; at the last kill {before} were in the store and {waiting} waited; drained: "
+              f"{len(stored)} in the store, {len(left)} wait, lost {len(lost)}, doubled {doubled}")  # fmt: skip
+        return int(bool(lost or left) or doubled > 0)
 
 
 def _printed(out: Path) -> set[int]:
@@ -294,7 +307,9 @@ def main() -> int:
     sized = actions.add_parser("scale")
     sized.add_argument("--sizes", type=int, nargs="+", default=[10_000, 100_000])
     sized.add_argument("--queries", type=int, default=200)
-    actions.add_parser("kills").add_argument("--kills", type=int, default=100)
+    killing = actions.add_parser("kills")
+    killing.add_argument("--kills", type=int, default=100)
+    killing.add_argument("--longest", type=float, default=6.0, help="seconds between two of them, at most")
     actions.add_parser("cut").add_argument("--seconds", type=float, default=600.0)
     pair = actions.add_parser("robots")
     pair.add_argument("names", nargs="*")
@@ -305,7 +320,7 @@ def main() -> int:
     args = parser.parse_args()
     os.nice(5)
     if args.action == "kills":
-        return kills(args.kills)
+        return kills(args.kills, args.longest)
     if args.action == "cut":
         return cut(args.seconds)
     if args.action == "robots":

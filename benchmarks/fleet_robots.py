@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.closure_sets import FALSE, IGNORE, TRUE, TruthSequence, sequence
-from benchmarks.closures import RememberedDescriber
+from benchmarks.closure_sets import FALSE, IGNORE, NARROW, TRUE, TruthSequence, sequence
+from benchmarks.closures import RememberedDescriber, small_motion
 from benchmarks.fleet import served
 from pnv_core.describe.describer import Describer, load_describer
 from pnv_core.recognizer import PlaceRecognizer
@@ -33,6 +33,8 @@ class Counts:
 
     right: int = 0
     wrong: int = 0
+    right_across: int = 0  # of these, by a match of the other robot's laps
+    wrong_across: int = 0
     found: list[bool] = field(default_factory=list)  # Q long
     found_across: list[bool] = field(default_factory=list)  # by a match of the other robot's laps
 
@@ -87,6 +89,12 @@ class _Marks:
         self._seen: list[int] = []
         self.counts = Counts()
 
+    def _label(self, i: int, j: int) -> int:
+        images = self._images
+        label = images.truth(i, j)
+        known = label != FALSE or images.name not in NARROW or not small_motion(images.read(i), images.read(j))
+        return label if known else IGNORE  # as `benchmarks.closures judge` counts
+
     def count(self, i: int, closures: list[LoopClosure]) -> None:
         """Closures of image i, which is a keyframe from now on."""
         images, laps = self._images, self._laps
@@ -95,9 +103,16 @@ class _Marks:
         if images.queries is not None and not images.queries[i]:
             return
         matches = [self._number[c.match.stamp_ns] for c in closures if c.accepted]
-        labels = {j: images.truth(i, j) for j in matches if j in old}  # recent ones show the same by being near in time
+        labels = {j: self._label(i, j) for j in matches if j in old}  # recent ones show the same by being near in time
         self.counts.right += sum(label == TRUE for label in labels.values())
         self.counts.wrong += sum(label == FALSE for label in labels.values())
+        wrong = [j for j, label in labels.items() if label == FALSE]
+        self.counts.wrong_across += sum(_other(laps, i, j) for j in wrong)
+        self.counts.right_across += sum(_other(laps, i, j) for j, label in labels.items() if label == TRUE)
+        for c in closures:
+            if c.accepted and self._number[c.match.stamp_ns] in wrong:
+                j=self._number[c.match.stamp_ns]
+                print("WRONG", i, j, "across" if _other(laps,i,j) else "own", f"{c.score:.3f}", c.evidence, flush=True)
         if any(images.truth(i, j) == TRUE for j in old if _other(laps, i, j)):
             true = [j for j, label in labels.items() if label == TRUE]
             self.counts.found.append(bool(true))
