@@ -33,7 +33,8 @@ _BATCH, _BATCH_BYTES = 16, 2_000_000
 _LONGEST_PAUSE_S = 30.0  # between tries of a store that fails
 _NICE = 10  # the fleet's threads give way to recognition
 _IDLE_S = 0.2
-_COUNTED = ("sent", "covered", "asked", "late", "closures", "refused", "bytes_sent", "bytes_received")
+_COUNTED = ("sent", "covered", "expired", "asked", "late", "closures", "refused", "bytes_sent", "bytes_received")
+_EXPIRY_S = 3600.0  # between two looks for places that are too old
 _CLOSE_S = 1.0
 _TIMEOUT_S = 5.0  # of one call to the store
 
@@ -50,6 +51,7 @@ class Options:
     kb_s: float
     coverage: float
     pictures: bool
+    keep_days: float = 0.0  # 0: for ever
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,7 @@ class FleetStatus:
     robots: dict[str, int]  # closures by the robot they are with
     sent: int = 0
     covered: int = 0  # keyframes not sent, since the fleet has their place
+    expired: int = 0  # places of this robot that were forgotten for their age
     asked: int = 0
     late: int = 0  # answers after the budget
     closures: int = 0
@@ -85,6 +88,7 @@ class FleetStatus:
             "fleet: keyframes waiting": str(self.waiting),
             "fleet: keyframes dropped": str(self.dropped),
             "fleet: keyframes covered": str(self.covered),
+            "fleet: places expired": str(self.expired),
             "fleet: queries": str(self.asked),
             "fleet: late answers": str(self.late),
             "fleet: rows refused": str(self.refused),
@@ -146,6 +150,7 @@ class Fleet:
         self._counts: Counter[str] = Counter()
         self._robots: Counter[str] = Counter()
         self._owed = 0.0  # bytes beyond the limit
+        self._newest_ns, self._expiry_due = 0, 0.0
         self._threads = [
             threading.Thread(target=self._guarded(run), name=f"fleet {name}", daemon=True)
             for name, run in (("keep", self._keep), ("ask", self._ask), ("send", self._send))
@@ -216,6 +221,7 @@ class Fleet:
 
     def _take(self, query: Query, oldest_ns: int, position: tuple[float, float, float] | None, offered: float) -> None:
         ref = query.ref
+        self._newest_ns = max(self._newest_ns, ref.stamp_ns)
         session = self._sessions.setdefault(ref.session, ref.stamp_ns)
         seen = without_picture(query.descriptor, query.valid)
         shared = None
@@ -304,6 +310,7 @@ class Fleet:
         while not self._ended.is_set():
             try:
                 busy = self._send_some()
+                self._expire()
             except FleetError as error:
                 self._fail(str(error))
                 busy = False
@@ -352,6 +359,20 @@ class Fleet:
             pending_keys = set(self._pending)
         now = {w.number: w for w in self._outbox.oldest(len(batch), 2 * _BATCH_BYTES, pending_keys)}
         return [now[w.number] for w in batch if w.number in now and now[w.number].asked]
+
+    def _expire(self) -> None:
+        """Now and then, forget this robot's places of long ago. Age is counted in its own stamps, as in a replay."""
+        if not self.options.keep_days or not self._newest_ns or time.monotonic() < self._expiry_due:
+            return
+        store = self._connected()
+        if store is None:
+            return
+        oldest_ns = self._newest_ns - int(self.options.keep_days * 86_400e9)
+        count = store.forget(f'robot == "{self._robot}" and stamp_ns < {oldest_ns}') if oldest_ns > 0 else 0
+        self._expiry_due = time.monotonic() + _EXPIRY_S
+        self._tally(expired=count)
+        if count:
+            self._say(f"fleet: forgot {count} places older than {self.options.keep_days:g} days")
 
     def _repay(self) -> None:
         """Wait until the limit allows to send again."""

@@ -25,7 +25,7 @@ def start_fleet(
     fleet = Fleet(
         Options(
             config.fleet_uri, robot, config.fleet_budget_ms, folder / file, config.fleet_outbox_mb, config.fleet_kb_s,
-            config.fleet_coverage, config.fleet_pictures,
+            config.fleet_coverage, config.fleet_pictures, config.fleet_keep_days,
         ),
         describer.config,
         describer.map_fingerprint,

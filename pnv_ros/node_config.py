@@ -93,6 +93,13 @@ class NodeConfig:
         high=1.0,
     )
     fleet_pictures: bool = setting(False, "send the small grey pictures; false sends their local features instead")
+    fleet_keep_days: float = setting(
+        0.0,
+        "this robot's places are forgotten, once an hour, when its newest image is so much newer; 0 = never",
+        unit="days",
+        low=0.0,
+        high=1e5,
+    )
     fleet_kb_s: float = setting(
         0.0, "bound on what is sent, less what is received; 0 = none", unit="kB/s", low=0.0, high=1e6
     )

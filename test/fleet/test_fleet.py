@@ -152,6 +152,24 @@ def test_what_the_fleet_has_is_not_sent_again(server, tmp_path):
         robot.fleet.close()
 
 
+def test_places_of_long_ago_are_forgotten_but_not_those_of_others(server, tmp_path):
+    old = Robot(tmp_path, "alpha", server.uri)
+    old.see(1, 2, 3)
+    old.settled()
+    old.fleet.close()
+    other = Robot(tmp_path, "beta", server.uri, old.model)
+    other.see(4, 5)
+    other.settled()
+    later = Robot(tmp_path, "alpha", server.uri, old.model, start_s=90_000, keep_days=1.0)  # 89,000 s later
+    later.see(6)
+    wait_until(lambda: later.status.expired == 3, 30, "the old places to be forgotten")
+    later.settled()
+    assert sorted(p.robot for p in later.store(server.uri).scan()) == ["alpha", "beta", "beta"]
+    assert any("forgot 3 places older than 1 days" in line for line in later.lines)
+    for robot in (other, later):
+        robot.fleet.close()
+
+
 def test_no_more_is_sent_than_the_limit_allows(server, tmp_path):
     robot = Robot(tmp_path, "alpha", server.uri, kb_s=100.0)
     start = time.monotonic()

@@ -1,9 +1,12 @@
 """The store over the wire: Milvus Lite's server, and servers that refuse, lie or are no longer there."""
 
 import base64
+import shutil
 import socket
+import subprocess
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -156,12 +159,32 @@ def test_a_server_that_never_answers_is_left_after_the_timeout():
         assert time.monotonic() - start < 8
 
 
-def test_a_wrong_token_is_said_without_the_token(tmp_path):
+@contextmanager
+def lite_behind(tmp_path, *interceptors, credentials=None):
+    """host:port of Milvus Lite's own service behind grpc's interceptors or TLS, which its command line has not."""
     grpc = pytest.importorskip("grpc", reason="the extra `fleet` is not installed")
     pytest.importorskip("milvus_lite", reason="the extra `fleet` is not installed")
     from milvus_lite.adapter.grpc.servicer import MilvusServicer
     from milvus_lite.db import MilvusLite
     from pymilvus.grpc_gen import milvus_pb2_grpc
+
+    database = MilvusLite(str(tmp_path / "places.db"))
+    guarded = grpc.server(ThreadPoolExecutor(2), interceptors=interceptors)
+    milvus_pb2_grpc.add_MilvusServiceServicer_to_server(MilvusServicer(database), guarded)
+    if credentials is None:
+        port = guarded.add_insecure_port("127.0.0.1:0")
+    else:
+        port = guarded.add_secure_port("127.0.0.1:0", credentials)
+    guarded.start()
+    try:
+        yield f"127.0.0.1:{port}"
+    finally:
+        guarded.stop(None)
+        database.close()
+
+
+def test_a_wrong_token_is_said_without_the_token(tmp_path):
+    grpc = pytest.importorskip("grpc", reason="the extra `fleet` is not installed")
 
     class Guard(grpc.ServerInterceptor):
         """As a Milvus with authorization: every call carries the token in base64."""
@@ -173,21 +196,50 @@ def test_a_wrong_token_is_said_without_the_token(tmp_path):
             refuse = lambda request, context: context.abort(grpc.StatusCode.UNAUTHENTICATED, "auth check failure")  # noqa: E731
             return grpc.unary_unary_rpc_method_handler(refuse)
 
-    database = MilvusLite(str(tmp_path / "places.db"))
-    guarded = grpc.server(ThreadPoolExecutor(2), interceptors=[Guard()])
-    milvus_pb2_grpc.add_MilvusServiceServicer_to_server(MilvusServicer(database), guarded)
-    uri = f"http://127.0.0.1:{guarded.add_insecure_port('127.0.0.1:0')}"
-    guarded.start()
-    try:
+    with lite_behind(tmp_path, Guard()) as address:
+        uri = f"http://{address}"
         PlaceStore(uri, "1" * 64, Access("robot:right"), DIM, PARTS).put([place(0)])
         for token in ("robot:wr0ng", ""):
             with pytest.raises(FleetError, match="refuses the token") as refusal:
                 PlaceStore(uri, "1" * 64, Access(token), DIM, PARTS, timeout_s=2.0)
             assert "wr0ng" not in str(refusal.value)
             assert "wr0ng" not in repr(Access(token))
-    finally:
-        guarded.stop(None)
-        database.close()
+
+
+def certificate(folder, name):
+    """(certificate, key) of 127.0.0.1 in PEM files, signed by itself."""
+    if shutil.which("openssl") is None:
+        pytest.skip("openssl is not installed")
+    files = folder / f"{name}.pem", folder / f"{name}.key"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2",
+         "-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1", "-out", files[0], "-keyout", files[1]],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    return files
+
+
+@pytest.mark.parametrize("mutual", [False, True])
+def test_a_store_behind_tls_takes_those_that_trust_it_and_are_trusted(tmp_path, monkeypatch, mutual):
+    grpc = pytest.importorskip("grpc", reason="the extra `fleet` is not installed")
+    served, robot = certificate(tmp_path, "store"), certificate(tmp_path, "robot")
+    pair = [(served[1].read_bytes(), served[0].read_bytes())]
+    credentials = grpc.ssl_server_credentials(pair, robot[0].read_bytes() if mutual else None, mutual)
+    with lite_behind(tmp_path, credentials=credentials) as address:
+        monkeypatch.setenv("PNV_FLEET_CA", str(served[0]))
+        if mutual:
+            with pytest.raises(FleetError, match="127.0.0.1"):
+                PlaceStore(f"https://{address}", "1" * 64, Access.from_environment(), DIM, PARTS, timeout_s=2.0)
+            monkeypatch.setenv("PNV_FLEET_CERT", str(robot[0]))
+            monkeypatch.setenv("PNV_FLEET_KEY", str(robot[1]))
+        store = PlaceStore(f"https://{address}", "1" * 64, Access.from_environment(), DIM, PARTS)
+        store.put([place(0)])
+        assert store.count() == 1
+        stranger = certificate(tmp_path, "stranger")
+        for uri, access in ((f"http://{address}", Access()), (f"https://{address}", Access(ca=str(stranger[0])))):
+            with pytest.raises(FleetError, match="127.0.0.1") as refusal:
+                PlaceStore(uri, "1" * 64, access, DIM, PARTS, timeout_s=2.0)
+            assert "\n" not in str(refusal.value)
 
 
 def test_access_comes_from_the_environment_and_files(tmp_path, monkeypatch):
