@@ -170,7 +170,8 @@ def scale(sizes: list[int], queries: int) -> None:
             disk = sum(f.stat().st_size for f in server.folder.rglob("*") if f.is_file())
             print(
                 f"{len(keys):>9}  {(size - before) / inserted:>8.0f}  {built:>18.0f} s  {np.median(ms):>6.1f} ms"
-                f"  {np.percentile(ms, 95):>5.1f}  {busy:>8.1f} ms  {right / 10 / queries:>9.3f}  {server.rss_mb():>4.0f} MB"
+                f"  {np.percentile(ms, 95):>5.1f}  {busy:>8.1f} ms  {right / 10 / queries:>9.3f}"
+                f"  {server.rss_mb():>4.0f} MB"
                 f"  {disk / len(keys):>6.0f} B",
                 flush=True,
             )
