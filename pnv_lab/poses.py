@@ -17,6 +17,7 @@ from pnv_core.errors import PnvError
 from pnv_lab.evaluation.datasets.tables import number, numbers, rows, words
 
 Floats = NDArray[np.float64]
+Frame = tuple[str, int]  # name, stamp in ns
 FAR_S = 0.1  # between a frame and its pose
 
 
@@ -48,7 +49,7 @@ class Poses:
             return 0.0
         return float(np.degrees(2 * np.arccos(min(1.0, abs(float(self.quaternions[a] @ self.quaternions[b]))))))
 
-    def of_frames(self, frames: Iterable[tuple[str, int]]) -> dict[tuple[str, int], int]:
+    def of_frames(self, frames: Iterable[Frame]) -> dict[Frame, int]:
         """Row by (name, stamp) of those with a pose. Raises PnvError where none has one."""
         asked = list(frames)
         found = {frame: row for frame in asked if (row := self.row(*frame)) is not None}
@@ -59,6 +60,39 @@ class Poses:
                 f"{asked[0][0]!r} at {asked[0][1] / 1e9:.3f} s"
             )
         return found
+
+
+class PoseTruth:
+    """Whether two frames of a run, each a (name, stamp), show one place: near each other and turned alike."""
+
+    def __init__(self, poses: Poses, frames: Iterable[Frame], radius_m: float, angle_deg: float) -> None:
+        """Raises PnvError where no frame has a pose."""
+        self.poses, self.rows = poses, poses.of_frames(frames)
+        self._radius_m, self._angle_deg = radius_m, angle_deg
+        self.rule = f"right: at most {radius_m:g} m apart and {angle_deg:g} degrees turned"
+
+    def position(self, frame: Frame) -> Floats | None:
+        """(3,) in metres."""
+        row = self.rows.get(frame)
+        return None if row is None else self.poses.positions[row]
+
+    def apart_m(self, a: Frame, b: Frame) -> float | None:
+        """Distance of two frames; None where a pose is not known."""
+        ends = self.position(a), self.position(b)
+        return None if ends[0] is None or ends[1] is None else float(np.linalg.norm(ends[0] - ends[1]))
+
+    def right(self, a: Frame, b: Frame) -> bool | None:
+        """None where a pose is not known."""
+        apart = self.apart_m(a, b)
+        if apart is None:
+            return None
+        return apart <= self._radius_m and self.poses.turn_deg(self.rows[a], self.rows[b]) <= self._angle_deg
+
+    def counted(self, pairs: Iterable[tuple[Frame, Frame]]) -> str:
+        """How many pairs are right, in words."""
+        verdicts = [self.right(*pair) for pair in pairs]
+        known = sum(v is not None for v in verdicts)
+        return f"{verdicts.count(True)} of {known} pairs with poses right, {verdicts.count(False)} wrong ({self.rule})"
 
 
 def read_poses(path: Path | str) -> Poses:

@@ -18,13 +18,15 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
 
 from msg_adapters.images import message_to_frame
 from msg_adapters.loop_closures import candidates_table
+from pnv_ros.markers import MARKERS_QOS
 from pnv_ros.outputs import PICTURE_QOS, TABLE_QOS
 from pnv_ros.watch_page import PAGE
 
-_KEPT = 2000  # queries drawn, over a quarter of an hour at two keyframes a second
+_KEPT = 2000  # queries and points drawn; queries: over a quarter of an hour at two keyframes a second
 
 
 class Watch(Node):
@@ -37,15 +39,17 @@ class Watch(Node):
             maxlen=_KEPT
         )  # query s, match s, score, accepted
         self._health: dict[str, Any] = {"message": f"nothing heard of {name} yet", "level": 1, "values": {}}
+        self._map: dict[str, list[list[float]]] = {"keyframes": [], "closures": []}
         self.picture = b""
         self.create_subscription(PointCloud2, f"{name}/candidates", self._candidates, TABLE_QOS)
         self.create_subscription(Image, f"{name}/match_image", self._match_image, PICTURE_QOS)
+        self.create_subscription(MarkerArray, f"{name}/markers", self._markers, MARKERS_QOS)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._diagnostics, 10)
 
     def state(self) -> dict[str, Any]:
         """What the page draws."""
         with self._lock:
-            return {"queries": list(self._queries), **self._health}
+            return {"queries": list(self._queries), "map": self._map, **self._health}
 
     def _candidates(self, message: PointCloud2) -> None:
         table = candidates_table(message)
@@ -54,6 +58,12 @@ class Watch(Node):
             query, match = (float(best[f"{side}_sec"]) + best[f"{side}_nsec"] / 1e9 for side in ("query", "match"))
             with self._lock:
                 self._queries.append((query, match, float(best["score"]), bool(best["accepted"])))
+
+    def _markers(self, message: MarkerArray) -> None:
+        drawn = {m.ns: [[round(v, 3) for v in (p.x, p.y, p.z)] for p in m.points] for m in message.markers}
+        points, lines = drawn.get("keyframes", []), drawn.get("closures", [])
+        with self._lock:
+            self._map = {"keyframes": points[:: 1 + len(points) // _KEPT], "closures": lines[-_KEPT:]}
 
     def _match_image(self, message: Image) -> None:
         rgb = message_to_frame(message, "match").rgb

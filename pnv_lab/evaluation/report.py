@@ -18,8 +18,8 @@ from pnv_lab.evaluation.datasets.seasons import TOLERANCES
 from pnv_lab.evaluation.evaluate import Evaluation, MethodResult
 from pnv_lab.evaluation.extraction import descriptor_of
 from pnv_lab.evaluation.metrics import precision_recall
+from pnv_lab.evaluation.plots import Axis, Series, histogram, legend, line_chart, path_map, scatter
 from pnv_lab.evaluation.summary import RECALLS, Figures, recall_curve
-from pnv_lab.evaluation.svg import Axis, Series, histogram, legend, line_chart, path_map, scatter
 
 RIGHT, WRONG, MISSED = "#009e73", "#d55e00", "#56b4e9"
 SHOWN = 4  # pictures of each kind; bounds the file to a few megabytes
@@ -36,6 +36,7 @@ main{max-width:1120px;margin:0 auto;padding:16px}
 h1{font-size:1.5rem;margin:.4em 0}
 h2{font-size:1.25rem;margin:2em 0 .4em;border-top:2px solid var(--line);padding-top:.8em}
 h3{font-size:1.02rem;margin:1.4em 0 .3em}p,dd{color:var(--soft)}code{font-size:.88em;overflow-wrap:anywhere}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:2px 12px;margin:.6em 0}dt{font-weight:600}dd{margin:0}
 .wide{overflow-x:auto;border:1px solid var(--line);border-radius:8px}
 table{border-collapse:collapse;width:100%;font-size:.86rem;font-variant-numeric:tabular-nums}
 th,td{padding:6px 10px;text-align:right;white-space:nowrap;border-bottom:1px solid var(--line)}
@@ -48,7 +49,7 @@ th:first-child{background:var(--panel)}td small{color:var(--soft)}td b{color:#0a
 .charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:16px}
 figure{margin:0;border:1px solid var(--line);border-radius:8px;padding:10px;background:var(--panel)}
 figure svg,figure img{width:100%;height:auto;display:block}
-svg text{font:12px system-ui,sans-serif;fill:var(--soft)}svg .grid{stroke:var(--line);stroke-width:1}
+svg{color:var(--soft)}details{margin:.4em 0}summary{cursor:pointer}
 figcaption{font-size:.8rem;color:var(--soft);margin-top:6px}
 .legend span{display:inline-flex;align-items:center;margin-right:14px}
 .legend i{width:12px;height:12px;border-radius:3px;margin-right:6px;display:inline-block}
@@ -88,7 +89,8 @@ def page(title: str, body: str) -> str:
 
 def about_lines(about: Sequence[tuple[str, str]]) -> str:
     """Names and values at the head of a report."""
-    return "".join(f"<p>{html.escape(name)}: <code>{html.escape(value)}</code></p>" for name, value in about)
+    rows = (f"<dt>{html.escape(name)}</dt><dd><code>{html.escape(value)}</code></dd>" for name, value in about)
+    return f"<dl>{''.join(rows)}</dl>"
 
 
 def _summary(figures: Sequence[Figures]) -> str:
@@ -127,7 +129,8 @@ def _chapter(evaluation: Evaluation, chapter: Chapter) -> str:
         f'<div class="charts">{"".join(_charts(results))}{_matrix(evaluation, results[0])}{_trajectory(results)}</div>',
     ]
     shown = next((r for r in reversed(results) if r.method.scorer and r.method.features == "patchnetvlad"), results[-1])
-    parts.append(_galleries(evaluation, shown))
+    for result in (shown, *(r for r in results if r is not shown)):
+        parts.append(_galleries(evaluation, result, opened=result is shown))
     return "".join(parts)
 
 
@@ -231,13 +234,14 @@ def _trajectory(results: Sequence[MethodResult]) -> str:
     dataset = result.dataset
     if not dataset.sequence or dataset.query_positions is None or len(dataset.queries) != len(dataset.references):
         return ""
-    links = []
+    links, colours = [], []
     for q, ranking in enumerate(result.rankings):
         if len(ranking.references) and (len(dataset.truth[q]) or result.decisions.scores[q] > _largest_wrong(result)):
-            links.append((q, int(ranking.references[0]), RIGHT if result.decisions.right[q] else WRONG))
+            links.append((q, int(ranking.references[0])))
+            colours.append(RIGHT if result.decisions.right[q] else WRONG)
     flat, axes = flattened(dataset.query_positions)
     key = legend(("right", "wrong"), (RIGHT, WRONG))
-    return f"<div><h3>Path and best candidates of revisits</h3>{path_map(flat, links, axes, key)}</div>"
+    return f"<div><h3>Path and best candidates of revisits</h3>{path_map(flat, links, colours, axes, key)}</div>"
 
 
 def _largest_wrong(result: MethodResult) -> float:
@@ -251,24 +255,24 @@ def flattened(positions: NDArray[np.float64]) -> tuple[list[tuple[float, float]]
     return [(float(p[a]), float(p[b])) for p in positions], ("xyz"[a], "xyz"[b])
 
 
-def _galleries(evaluation: Evaluation, result: MethodResult) -> str:
-    """Right matches, confident wrong ones, and missed places."""
+def _galleries(evaluation: Evaluation, result: MethodResult, opened: bool) -> str:
+    """Right matches, confident wrong ones, and missed places; folded and without right ones unless `opened`."""
     decisions = result.decisions
     answered = np.isfinite(decisions.scores)
     by_score = np.argsort(-decisions.scores, kind="stable")
     right = [q for q in by_score if answered[q] and decisions.right[q]]
     wrong = [q for q in by_score if answered[q] and not decisions.right[q]]
     missed = [q for q in by_score[::-1] if decisions.possible[q] and not decisions.right[q]]
-    parts = [f"<h3>What {html.escape(result.method.label)} did</h3>"]
+    parts = [f"<summary>{html.escape(result.method.label)}: {len(right)} right, {len(wrong)} wrong</summary>"]
     for title, queries, colour in (
-        ("Right: from the most to the least certain", spread(right), RIGHT),
+        ("Right: from the most to the least certain", spread(right) if opened else [], RIGHT),
         ("Wrong: the most certain first", wrong[:SHOWN], WRONG),
         ("Missed: the query beside its best true reference", missed[:SHOWN], MISSED),
     ):
-        pictures = [_picture(evaluation, result, int(q), colour) for q in queries]
-        empty = "" if pictures else "<p>None.</p>"
-        parts.append(f'<h3>{title}</h3>{empty}<div class="gallery">{"".join(pictures)}</div>')
-    return "".join(parts)
+        pictures = "".join(_picture(evaluation, result, int(q), colour) for q in queries)
+        if pictures:
+            parts.append(f'<h3>{title}</h3><div class="gallery">{pictures}</div>')
+    return f"<details{' open' if opened else ''}>{''.join(parts)}</details>"
 
 
 def spread(ranked: Sequence[T]) -> list[T]:
@@ -282,12 +286,12 @@ def _picture(evaluation: Evaluation, result: MethodResult, query: int, colour: s
     """Query and reference side by side with their patch correspondences, as a figure."""
     dataset, method, ranking = result.dataset, result.method, result.rankings[query]
     reference = int(ranking.references[0])
-    words = f"score {ranking.scores[0]:.3f}"
+    words = f"{'right' if colour == RIGHT else 'wrong'}, score {ranking.scores[0]:.3f}"
     if colour == MISSED:
         true = dataset.truth[query]
         listed = [(i, int(r)) for i, r in enumerate(ranking.references) if r in true]
         reference = listed[0][1] if listed else int(true[0])
-        words = f"ranked {listed[0][0] + 1}" if listed else "not among the candidates"
+        words = f"missed, ranked {listed[0][0] + 1}" if listed else "missed, not a candidate"
     paths = dataset.queries[query], dataset.references[reference]
     images = [read_image(p) for p in paths]
     matches: tuple[PatchMatches, ...] = ()

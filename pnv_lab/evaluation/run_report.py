@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pnv_core.drawing import draw_match
 from pnv_core.images import decode_image, read_image
 from pnv_core.types import Frame, ImageRef, LoopClosure
+from pnv_lab.evaluation.plots import Axis, Series, histogram, path_map, scatter
 from pnv_lab.evaluation.report import (
     PICTURE_SIZE,
     RIGHT,
@@ -25,8 +26,7 @@ from pnv_lab.evaluation.report import (
     page,
     spread,
 )
-from pnv_lab.evaluation.svg import Axis, Series, histogram, legend, path_map, scatter, score_colour
-from pnv_lab.poses import Poses
+from pnv_lab.poses import PoseTruth
 
 _GREY = "#8a94a0"
 _BINS = 24
@@ -57,25 +57,43 @@ class RunRecorder:
             self.best.append(replace(closures[0], matches=()))
             self._refused = sorted([*self._refused, closures[0]], key=lambda c: -c.score)[:SHOWN]
 
-    def html(self, about: Sequence[tuple[str, str]], poses: Poses | None = None) -> str:
-        """The report; `about` are names and values for its head. Raises PnvError for poses of no frame."""
+    def pair(self, closure: LoopClosure, verdict: str = "") -> NDArray[np.uint8] | None:
+        """The picture of a closure with verdict and score burned in, as BGR; None where an image is not kept."""
+        query, match = (self._image(ref) for ref in (closure.query, closure.match))
+        if query is None or match is None:
+            return None
+        words = f"{verdict or closure.reason or 'accepted'}, score {closure.score:.3f}"
+        return fitted(draw_match(query, match, closure.matches, self.image_size, words))
+
+    def html(self, about: Sequence[tuple[str, str]], truth: PoseTruth | None = None) -> str:
+        """The report; `about` are names and values for its head."""
         accepted = [c for c in self.best if c.accepted]
         refused = [c for c in self.best if not c.accepted]
-        rows = poses.of_frames((name, stamp) for (_, stamp), name in self._names.items()) if poses else {}
         charts = [self._timeline(accepted, refused), self._scores(accepted, refused)]
-        if poses:
-            charts.append(self._path(accepted, poses, rows))
+        if truth:
+            charts.append(self._path(accepted, truth))
         by_score = sorted(accepted, key=lambda c: -c.score)
+        wrong = [c for c in by_score if truth and truth.right(*self.frames(c)) is False]
+        good = [c for c in by_score if c not in wrong]
         groups = (
-            ("Accepted: the best closure of a query, from the most to the least certain", spread(by_score), RIGHT),
-            ("Refused: the highest scores", self._refused, WRONG),
+            (
+                f"Accepted, but wrong by the poses ({truth.rule if truth else ''}): the most certain first",
+                wrong[:SHOWN],
+            ),
+            ("Accepted: the best closure of a query, from the most to the least certain", spread(good)),
+            ("Refused: the highest scores", self._refused),
         )
         body = ["<h1>Loop closures of a sequence</h1>", about_lines(about)]
         body.append(f'<div class="charts">{"".join(charts)}</div>')
-        for title, closures, colour in groups:
-            pictures = "".join(self._figure(c, colour, poses, rows) for c in closures)
+        for title, closures in groups[0 if wrong else 1 :]:
+            pictures = "".join(self._figure(c, truth) for c in closures)
             body.append(f'<h3>{title}</h3><div class="gallery">{pictures or "<p>None.</p>"}</div>')
         return page("Loop closures of a sequence", "".join(body))
+
+    def frames(self, closure: LoopClosure) -> tuple[tuple[str, int], tuple[str, int]]:
+        """(name, stamp) of both images."""
+        query, match = ((self._name(ref), ref.stamp_ns) for ref in (closure.query, closure.match))
+        return query, match
 
     def close(self) -> None:
         """Remove the pictures."""
@@ -116,33 +134,32 @@ class RunRecorder:
         chart = histogram(groups, Axis("score of the best candidate", 0, 1), (RIGHT, _GREY))
         return f"<div><h3>Scores</h3>{chart}</div>"
 
-    def _path(self, accepted: Sequence[LoopClosure], poses: Poses, rows: dict[tuple[str, int], int]) -> str:
+    def _path(self, accepted: Sequence[LoopClosure], truth: PoseTruth) -> str:
         """The way of the frames, metres to scale, and every query's best closure coloured by its score."""
-        frames = [(key, row) for (_, s), n in sorted(self._names.items(), key=lambda item: item[0][1])
-                  if (row := rows.get(key := (n, s))) is not None]  # fmt: skip
-        place = {key: i for i, (key, _) in enumerate(frames)}
-        flat, axes = flattened(poses.positions[[row for _, row in frames]])
-        links = []
+        frames = sorted(((n, s) for (_, s), n in self._names.items() if (n, s) in truth.rows), key=lambda f: f[1])
+        place = {frame: i for i, frame in enumerate(frames)}
+        flat, axes = flattened(truth.poses.positions[[truth.rows[frame] for frame in frames]])
+        links, scores = [], []
         for c in accepted:
-            ends = [place.get((self._name(ref), ref.stamp_ns)) for ref in (c.query, c.match)]
+            ends = [place.get(frame) for frame in self.frames(c)]
             if ends[0] is not None and ends[1] is not None:
-                links.append((ends[0], ends[1], score_colour(c.score)))
-        scores = ", ".join(f"score {score}" for score in ("0.5", "0.75", "1"))
-        colours = legend(scores.split(", "), [score_colour(score) for score in (0.5, 0.75, 1.0)])
-        return f"<div><h3>Path and loop closures</h3>{path_map(flat, links, axes, colours)}</div>"
+                links.append((ends[0], ends[1]))
+                scores.append(c.score)
+        return f"<div><h3>Path and loop closures</h3>{path_map(flat, links, scores, axes)}</div>"
 
-    def _figure(self, closure: LoopClosure, colour: str, poses: Poses | None, rows: dict[tuple[str, int], int]) -> str:
-        refs = closure.query, closure.match
-        query, match = (self._image(ref) for ref in refs)
-        if query is None or match is None:
+    def _figure(self, closure: LoopClosure, truth: PoseTruth | None) -> str:
+        frames = self.frames(closure)
+        right = truth.right(*frames) if truth else None
+        verdict = {True: "right", False: "wrong", None: ""}[right]
+        drawn = self.pair(closure, verdict)
+        if drawn is None:
             return ""
-        drawn = draw_match(query, match, closure.matches, self.image_size, f"score {closure.score:.3f}")
-        words = " ↔ ".join(html.escape(self._name(ref)) for ref in refs)
+        words = " ↔ ".join(html.escape(name) for name, _ in frames)
         if closure.reason:
             words += f" ({closure.reason})"
-        taken = [rows.get((self._name(ref), ref.stamp_ns)) for ref in refs]
-        if poses and taken[0] is not None and taken[1] is not None:
-            words += f", {np.linalg.norm(poses.positions[taken[0]] - poses.positions[taken[1]]):.1f} m apart"
-        image = f'<img loading="lazy" alt="{words}" src="{data_uri(fitted(drawn))}">'
-        caption = f"score {closure.score:.3f}, {words}"
+        if truth and (apart := truth.apart_m(*frames)) is not None:
+            words += f", {apart:.1f} m apart"
+        colour = _GREY if right is None else RIGHT if right else WRONG
+        image = f'<img loading="lazy" alt="{words}" src="{data_uri(drawn)}">'
+        caption = f"{verdict}{', ' * bool(verdict)}score {closure.score:.3f}, {words}"
         return f'<figure style="border-left-color:{colour}">{image}<figcaption>{caption}</figcaption></figure>'

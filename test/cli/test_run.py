@@ -85,6 +85,37 @@ def test_poses_of_every_layout_mean_the_same(walk, model, poses):
     assert pairs == [[row["query"], row["match"]] for row in rows]
 
 
+def test_closures_are_judged_by_the_poses(walk, model, capsys):
+    command = ["run", "walk/images", "--out", "o", "--poses", "named.csv", "--radius-m", "2"]
+    assert main([*command, *model, *SURE]) == 0
+    told = capsys.readouterr().out
+    pairs = [
+        [int(row[side][0]) for side in ("query", "match")] for row in csv.DictReader((walk / "o/closures.csv").open())
+    ]
+    apart = [np.hypot(*np.subtract(WAY[query], WAY[match])) for query, match in pairs]
+    right, wrong = sum(d <= 2 for d in apart), sum(d > 2 for d in apart)
+    assert right > 0 < wrong
+    words = f"{right} of {right + wrong} pairs with poses right, {wrong} wrong (right: at most 2 m apart"
+    assert words in told
+    page = (walk / "o" / "report.html").read_text()
+    assert words in page
+    for verdict, far in re.findall(r"<figcaption>(right|wrong), score [^<]* ([\d.]+) m apart<", page):
+        assert (verdict == "right") == (float(far) <= 2)
+
+
+def test_a_recording_is_read_by_the_program_that_shows_it(walk, model):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed (extra rerun)")
+    assert main(["run", "walk/images", "--rrd", "r.rrd", "--poses", "way.tum", *model, *SURE]) == 0
+    assert not (walk / "out").exists()
+    assert [path.name for path in walk.glob("*.rrd*")] == ["r.rrd"]
+    for command in ("verify", "stats"):
+        program = [Path(sys.executable).parent / "rerun", "rrd", command, "r.rrd"]
+        told = subprocess.run(program, cwd=walk, capture_output=True, text=True, timeout=60)
+        assert told.returncode == 0, told.stderr
+    for entity in ("/image", "/match", "/path", "/path/closures", "/score/best", "/score/bar", "/similarity/best"):
+        assert re.search(rf"^{entity}: \d+$", told.stdout, re.M), told.stdout
+
+
 def test_poses_of_other_frames_and_without_orientation_are_refused(walk, model, capsys):
     (walk / "far.csv").write_text("timestamp,x,y\n1000,0,0\n")
     assert main(["run", "walk/images", "--out", "o", "--poses", "far.csv", *model, *SURE]) == 2

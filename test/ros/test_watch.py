@@ -40,6 +40,7 @@ def test_the_page_shows_scores_health_and_the_match_of_a_running_node(domain, tm
         with running_node(min_change=0.0, **{"qos_overrides./camera/image_raw.subscription.reliability": "reliable"}):
             assert publisher("--reliable", "--stamps", table, "--rate", "2", "--linger", "3").wait() == 0
             wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["queries"]) >= 3, 60, "queries on the page")
+            wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["map"]["keyframes"]) >= 3, 30, "a map")
             state = json.loads(fetched(f"{url}/state.json"))
             picture = cv2.imdecode(np.frombuffer(fetched(f"{url}/match.jpg"), np.uint8), cv2.IMREAD_COLOR)
         assert picture.std() > 10
@@ -48,6 +49,8 @@ def test_the_page_shows_scores_health_and_the_match_of_a_running_node(domain, tm
             assert 0 <= score <= 1
             assert isinstance(accepted, bool)
         assert "accept_score" in state["values"]
+        keyframes = np.array(state["map"]["keyframes"])  # on a time-line, 0.1 m a second, without odometry
+        assert set(keyframes[:, 0].round(3)) <= {0.0, 4.0, 8.0, 12.0, 16.0, 20.0}
     finally:
         watch.child.terminate()
         watch.child.wait(30)
