@@ -173,10 +173,24 @@ def baselines(args: argparse.Namespace) -> list[tuple[TorchTrunk, dict[str, Head
 
 def with_default(describer: Describer, known: RecallSet, depth: int) -> list[tuple[str, list[float]]]:
     """The default model before and after re-ranking its first `depth`: by the spatial score, and by all evidence."""
-    queries, references = (
-        [_slim(describer.describe(pixels(image, describer.image_size))) for image in part]
-        for part in (known.queries, known.references)
-    )
+    queries, references = (described(describer, part) for part in (known.queries, known.references))
+    found = orders(describer, queries, references, known, depth)
+    return [(f"default, {name}", recalls(order, known.truth)) for name, order in found.items()]
+
+
+def described(describer: Describer, images: Sequence[Path | Pixels]) -> list[PlaceDescriptor]:
+    """Patches in half precision, as the database keeps them."""
+    return [_slim(describer.describe(pixels(image, describer.image_size))) for image in images]
+
+
+def orders(
+    describer: Describer,
+    queries: list[PlaceDescriptor],
+    references: list[PlaceDescriptor],
+    known: RecallSet,
+    depth: int,
+) -> dict[str, NDArray[np.int64]]:
+    """The references of each query, best first: globally; of the first `depth` by patches, and by all evidence."""
     vectors = [np.stack([d.global_vector for d in part]) for part in (queries, references)]
     order = ranked(*vectors, known.counted)
     config = describer.config.replace(verify=0)
@@ -188,8 +202,7 @@ def with_default(describer: Describer, known: RecallSet, depth: int) -> list[tup
         judged = judge.judge(ImageRef(-1, 0, ""), query, 1.0, found, [references[c] for c in head], config)
         better[row, : len(head)] = [closure.match.id for closure in judged]
         spatial[row, : len(head)] = [c.match.id for c in sorted(judged, key=lambda c: -c.spatial)]
-    orders = {"global": order, "patches": spatial, "re-ranked": better}
-    return [(f"default, {name}", recalls(found, known.truth)) for name, found in orders.items()]
+    return {"global": order, "patches": spatial, "re-ranked": better}
 
 
 def opened(args: argparse.Namespace) -> Iterator[RecallSet]:
@@ -208,7 +221,6 @@ def opened(args: argparse.Namespace) -> Iterator[RecallSet]:
 
 
 def _slim(descriptor: PlaceDescriptor) -> PlaceDescriptor:
-    """Patches in half precision, as the database keeps them."""
     slim = tuple(replace(p, descriptors=p.descriptors.astype(np.float16)) for p in descriptor.patches)
     return replace(descriptor, patches=slim)
 

@@ -66,10 +66,13 @@ def stamp_of(message: Any) -> int:
     return int(message.header.stamp.sec) * 1_000_000_000 + int(message.header.stamp.nanosec)
 
 
-def message_to_frame(message: Any, camera: str) -> Frame:
-    """Image or CompressedImage -> Frame. Raises ImageError in one line for anything unusable."""
-    convert = compressed_to_rgb if hasattr(message, "format") else image_to_rgb
-    return Frame(stamp_ns=stamp_of(message), camera=camera, rgb=convert(message))
+def message_to_frame(message: Any, camera: str, enough: tuple[int, int] | None = None) -> Frame:
+    """Image or CompressedImage -> Frame. Raises ImageError in one line for anything unusable.
+
+    A JPEG is decoded to a fraction of its size where that is still `enough` (width, height).
+    """
+    rgb = compressed_to_rgb(message, enough) if hasattr(message, "format") else image_to_rgb(message)
+    return Frame(stamp_ns=stamp_of(message), camera=camera, rgb=rgb)
 
 
 def image_to_rgb(message: Any) -> NDArray[np.uint8]:
@@ -99,7 +102,7 @@ def image_to_rgb(message: Any) -> NDArray[np.uint8]:
     return encoding.to_rgb(rows.view(dtype).astype(encoding.dtype, copy=False).reshape(shape))
 
 
-def compressed_to_rgb(message: Any) -> NDArray[np.uint8]:
+def compressed_to_rgb(message: Any, enough: tuple[int, int] | None = None) -> NDArray[np.uint8]:
     """sensor_msgs/CompressedImage of jpeg or png (8 or 16 bit) -> (H, W, 3) uint8, as `decode_image` gives it.
 
     The size is read from the file's header and checked before anything is unpacked; a file that stops early is
@@ -117,7 +120,7 @@ def compressed_to_rgb(message: Any) -> NDArray[np.uint8]:
     name = f"{kind} image of {len(data)} bytes"
     if kind == "jpeg" and (scans := data.count(b"\xff\xda")) > MAX_JPEG_SCANS:
         raise ImageError(f"{name} has {scans} scans; allowed: at most {MAX_JPEG_SCANS}")
-    rgb = decode_image(data, name, (kind,))
+    rgb = decode_image(data, name, (kind,), enough)
     check_size(rgb.shape[1], rgb.shape[0])
     return rgb
 

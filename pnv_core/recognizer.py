@@ -41,6 +41,12 @@ class PlaceRecognizer:
         self.latest: Query | None = None  # of the last frame processed; None where it was no keyframe
         self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
 
+    @property
+    def enough(self) -> tuple[int, int]:
+        """(width, height) in pixels; what a larger image shows beyond that is not looked at."""
+        width, height = self.describer.image_size
+        return max(width, self.judge.verifier.side if self.config.verify else 0), height
+
     def process(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate examined for the frame, best first, accepted or refused with a reason.
 

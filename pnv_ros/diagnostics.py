@@ -52,6 +52,7 @@ class Diagnostics:
         if inputs.paused:
             self._warned.clear()  # it says nothing about whether images come
         else:
+            inputs.follow_losses(list(silent))
             self._log_silence(now, silent, inputs)
 
         losses = self._losses(settings.node.image_topics, inputs)
@@ -82,7 +83,8 @@ class Diagnostics:
             text = losses[0]
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
-        self.publish(level, text, self._values(rates, settings, inputs) | (fleet.values() if fleet is not None else {}))
+        values = self._values(rates, settings, inputs) | _shares(late, settings.node.image_topics)
+        self.publish(level, text, values | (fleet.values() if fleet is not None else {}))
 
     def _losses(self, topics: Sequence[str], inputs: ImageInputs) -> list[str]:
         """What the middleware loses of late; each topic's is logged once."""
@@ -172,3 +174,11 @@ class Diagnostics:
             elif now - since >= limit_s:
                 silent[topic] = now - since
         return silent
+
+
+def _shares(late: Counts, topics: Sequence[str]) -> dict[str, str]:
+    """Of several cameras, how much of what was processed of late each one had."""
+    if len(topics) < 2:
+        return {}
+    total = max(late.processed.total(), 1)
+    return {f"share of what is processed, {t} [%]": f"{100 * late.processed[t] / total:.0f}" for t in topics}

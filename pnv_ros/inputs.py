@@ -1,7 +1,7 @@
 """Image subscriptions: from the wire to the newest-frame slot."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -11,7 +11,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CompressedImage, Image
 
 from pnv_core.timing import StageTimer
-from pnv_ros.losses import TransportLosses
+from pnv_ros.losses import TransportLosses, profile
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.slot import NewestFrames, WaitingFrame
 from pnv_ros.stamps import StampRule, StampVerdict, in_seconds
@@ -25,7 +25,8 @@ OVERRIDABLE = (
 )
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"  # a publisher whose name is not discovered yet
 _MOST_LOOKS = 10
-_TYPES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": CompressedImage}
+_COMPRESSED = "sensor_msgs/msg/CompressedImage"
+_TYPES = {"sensor_msgs/msg/Image": Image, _COMPRESSED: CompressedImage}
 
 
 def image_qos() -> QoSProfile:
@@ -66,6 +67,7 @@ class ImageInputs:
         self._told: set[tuple[str, StampVerdict]] = set()
         self._subscriptions: dict[str, Any] = {}
         self._mismatches: dict[str, str] = {}  # topic: policy
+        self._sources: dict[str, str] = {}  # topic: the one listened to in its place
         self._looks: dict[str, int] = {}  # topic: how often the names of its publishers were looked up
         try:
             for topic in config.image_topics:
@@ -96,6 +98,30 @@ class ImageInputs:
                 self._subscribe(topic, _TYPES[kinds.pop()])
                 self._node.get_logger().info(f"now listening to {self.describe(topic)}, as it is published")
 
+    def follow_losses(self, silent: Sequence[str] = ()) -> None:
+        """Where transport is auto, ask for image_transport's JPEGs of a topic whose raw images are lost on the way.
+
+        `silent` are topics on which nothing came for long.
+        """
+        if self._config.transport != "auto":
+            return
+        for topic, subscription in list(self._subscriptions.items()):
+            lost = self.losses.share(topic)
+            if subscription.msg_type is not Image or not (self.losses.many(topic) or topic in silent):
+                continue
+            compressed = f"{topic}/compressed"
+            if all(info.topic_type != _COMPRESSED for info in self._publishers(compressed)):
+                continue
+            self._node.destroy_subscription(subscription)
+            self.losses.forget(topic)
+            self._sources[topic] = compressed
+            self._subscribe(topic, CompressedImage)
+            what = "no image arrives" if topic in silent else f"the middleware loses {100 * lost:.0f} % of the frames"
+            self._node.get_logger().warning(
+                f"{what} of {topic}: now listening to {self.describe(topic)} in its place; "
+                f"for raw images set FASTRTPS_DEFAULT_PROFILES_FILE={profile()} for the camera and for this node"
+            )
+
     def hint(self, topic: str) -> str:
         """Why nothing may come on a topic, in words."""
         publishers = self._publishers(topic)
@@ -112,6 +138,7 @@ class ImageInputs:
         return in_seconds(self._stamps.last(topic))
 
     def _publishers(self, topic: str) -> list[Any]:
+        topic = self._sources.get(topic, topic)
         return self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
 
     def _expected_type(self, topic: str) -> type:
@@ -125,7 +152,7 @@ class ImageInputs:
     def _subscribe(self, topic: str, message_type: type) -> None:
         self._subscriptions[topic] = self._node.create_subscription(
             message_type,
-            topic,
+            self._sources.get(topic, topic),
             self._callback(topic, message_type),
             image_qos(),
             raw=True,

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 _STAMPS = 90  # latest ones looked at: three seconds at 30 Hz
+_LEAST = 45  # of them say something
 _WORTH_SAYING = 0.15  # share lost
 _PROFILE = "fastdds_shared_memory.xml"
 
@@ -29,7 +30,7 @@ class TransportLosses:
     def share(self, topic: str) -> float:
         """Lost frames as a share of those sent of late, in [0, 1); 0 while too few arrived to tell."""
         stamps = np.array(self._stamps.get(topic, ()), np.int64)
-        if len(stamps) < _STAMPS:
+        if len(stamps) < _LEAST:
             return 0.0
         gaps = np.diff(stamps).astype(np.float64)
         shorter = np.median(np.sort(gaps)[: len(gaps) // 4])
@@ -37,10 +38,18 @@ class TransportLosses:
         sent = np.maximum(np.rint(gaps / period), 1).sum()
         return float(1 - len(gaps) / sent)
 
+    def forget(self, topic: str) -> None:
+        """Its images come another way from now on."""
+        self._stamps.pop(topic, None)
+
+    def many(self, topic: str) -> bool:
+        """Whether the loss is worth doing something about."""
+        return self.share(topic) >= _WORTH_SAYING
+
     def sentence(self, topic: str) -> str:
         """What to do about a loss worth saying; empty where there is none."""
         share = self.share(topic)
-        if share < _WORTH_SAYING:
+        if not self.many(topic):
             return ""
         advice = f"set FASTRTPS_DEFAULT_PROFILES_FILE={profile()} for the camera and for this node (with Fast DDS)"
         return (

@@ -134,7 +134,8 @@ class Recognition:
     def _unpacked(self, waiting: WaitingFrame) -> Frame:
         with self.recognizer.timer.stage("decode"):
             message = deserialize_message(waiting.serialized, waiting.message_type)
-            frame = message_to_frame(message, waiting.camera)
+            view = self.views[waiting.camera]
+            frame = message_to_frame(message, waiting.camera, self.recognizer.enough if view.scalable else None)
             size = frame.rgb.shape[1], frame.rgb.shape[0]
             known = self._sizes.setdefault(waiting.camera, size)
             if size != known:
@@ -144,7 +145,7 @@ class Recognition:
                     f"images of {waiting.camera} changed from {known[0]}x{known[1]} to {size[0]}x{size[1]}; "
                     "both are resized to the model's input, but one topic should carry one camera",
                 )
-            return self.views[waiting.camera](frame)
+            return view(frame)
 
     def _tell(self, closures: list[LoopClosure], accepted: int) -> None:
         """A line per closed loop, at most one in some seconds; with --log-level debug why the best was refused."""

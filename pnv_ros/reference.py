@@ -142,8 +142,11 @@ pixels: a 12 bit camera's frames keep their brightness whatever hot pixels there
 is brightened.
 
 Uncompressed images of more than a few hundred kilobytes need a larger shared memory segment than Fast DDS has by
-default: set `FASTRTPS_DEFAULT_PROFILES_FILE` to `config/fastdds_shared_memory.xml` for camera and node, or send
-compressed images.
+default: set `FASTRTPS_DEFAULT_PROFILES_FILE` to `config/fastdds_shared_memory.xml` for camera and node. The node tells
+from the stamps how many frames are lost. With `transport: auto` it goes over to the JPEGs of `TOPIC/compressed`, as
+image_transport publishes them, where a sixth or more is lost; where there are none, the log and /diagnostics say what
+to set. JPEGs are decoded at a half, a quarter or an eighth where that is as large as what is looked at, unless `crop`
+or a CameraInfo counts pixels.
 
 The QoS of each image topic can be set by rclpy's overrides
 (`qos_overrides./camera/image_raw.subscription.reliability: reliable`): {overridable}. A publisher that does not

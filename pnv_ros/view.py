@@ -40,6 +40,11 @@ class View:
         return dataclasses.replace(frame, rgb=np.ascontiguousarray(rgb[window]),
                                    valid=None if valid is None else valid[window] > 127)  # fmt: skip
 
+    @property
+    def scalable(self) -> bool:
+        """Whether a smaller picture of the same scene may be given: nothing here counts the camera's pixels."""
+        return not any(self._crop) and not self.needs_info
+
     def intrinsics(self, rectifier: Rectifier) -> Intrinsics:
         """Of the images this view gives with a rectifier. Raises ConfigError."""
         (fx, fy, cx, cy), (left, top, right, _) = rectifier.focal_and_centre, self._crop

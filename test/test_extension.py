@@ -22,6 +22,8 @@ def quarters():
 class SamePicture:
     """Keeps the mean of every 32nd row and agrees on as many points as there are equal means."""
 
+    side = 32
+
     def keep(self, rgb, camera, valid=None):
         return rgb[::32].mean((1, 2)).astype(np.float32).tobytes()
 

@@ -1,4 +1,4 @@
-"""Describing with OpenVINO: the trunk is one graph, what follows it another that always computes in float32.
+"""Describing with OpenVINO: pixels to descriptors in one graph.
 
 K clusters, C channels, W channels before the trunk's neck, h x w feature map (N = h * w cells), D dimensions,
 n = patches of one size. Window sums add one axis at a time and cancel nothing. A projection is linear and so is the sum
@@ -7,8 +7,8 @@ the intra-normalisation need the unprojected sums.
 """
 
 import hashlib
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -33,28 +33,28 @@ class OpenVinoDescribing:
     def __init__(
         self, model: Model, size: tuple[int, int], windows: Windows, threads: int, precision: str, cache: Path | None
     ) -> None:
-        """`precision` is that of the trunk; `cache` a folder for what is compiled."""
-        trunk, (width, height) = model.trunk, size
-        self.cells = trunk.shape(width, height)[1:]
-        self._cells = np.ones((1, 1, *self.cells), np.float32)
-        self._dense = trunk.dense
+        """`precision` is that of the network; `cache` a folder for what is compiled."""
+        self._model, self._size, self._cache, self._dense = model, size, cache, model.trunk.dense
+        self._settings = threads, precision
+        cells = model.trunk.shape(*size)[1:]
+        self._every = np.ones((1, 1, *cells), np.float32)
+        shaping = size, tuple(map(tuple, windows))
+        if self._dense is None:
+            self._graph = self._compiled(partial(describing, model, size, windows), "describing", *shaping)
+        else:
+            self._graph = self._compiled(partial(head, model, cells, windows), "head", *shaping)
 
-        def kept(*shaping: object) -> Path | None:
-            if cache is None:
-                return None
-            return cache / hashlib.sha256(f"{model.fingerprint()} {shaping}".encode()).hexdigest()[:32]
+    def _compiled(self, graph: Callable[[], ov.Model], *shaping: object) -> Compiled:
+        name = hashlib.sha256(f"{self._model.fingerprint()} {shaping}".encode()).hexdigest()[:32]
+        return Compiled(graph, *self._settings, None if self._cache is None else self._cache / name)
 
-        self._trunk: Compiled | None = None
-        if trunk.dense is None:
-            self._trunk = Compiled(partial(_trunk, model, size), threads, precision, kept("trunk", size))
-        self._head = Compiled(
-            partial(head, model, self.cells, windows), threads, kept=kept("head", self.cells, [*map(tuple, windows)])
-        )
+    @cached_property
+    def _trunk(self) -> Compiled:
+        return self._compiled(partial(trunk_maps, self._model, self._size), "trunk", self._size)
 
     def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, Floats]:
         """The trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
-        if self._trunk is None:
-            assert self._dense is not None
+        if self._dense is not None:
             features = self._dense(pixels)
             return features, features
         found = self._trunk(np.ascontiguousarray(pixels)[None])
@@ -62,35 +62,54 @@ class OpenVinoDescribing:
 
     def describe(self, pixels: NDArray[np.uint8], cells: Floats | None = None) -> tuple[Floats, list[Floats]]:
         """The global vector (D,) and the patches [(n, D), ...]. `cells` (h, w) say how much each cell counts."""
-        features, wide = self.maps(pixels)
-        counted = self._cells if cells is None else np.ascontiguousarray(cells, np.float32).reshape(self._cells.shape)
-        vector, *patches = self._head(features[None], wide[None], counted)
+        counted = self._every if cells is None else np.ascontiguousarray(cells, np.float32).reshape(self._every.shape)
+        if self._dense is None:
+            vector, *patches = self._graph(np.ascontiguousarray(pixels)[None], counted)
+        else:
+            features = self._dense(pixels)[None]
+            vector, *patches = self._graph(features, features, counted)
         return vector, patches
 
 
-def _trunk(model: Model, size: tuple[int, int]) -> ov.Model:
-    """(1, H, W, 3) uint8 -> the trunk's maps, and those before its neck where it has one."""
-    trunk, weights = model.trunk, model.part("trunk")
-    pixels, images = image_input(*size)
-    wide = build(trunk.layers, weights, images)
-    return ov.Model([build(trunk.neck, weights, wide), wide] if trunk.neck else [wide], [pixels], "trunk")
+def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Model:
+    """(1, H, W, 3) uint8 and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
+    pixels, features, wide = _maps(model, size)
+    counted = ops.parameter([1, 1, *model.trunk.shape(*size)[1:]], np.float32)
+    return ov.Model(_described(model, features, wide, counted, windows), [pixels, counted], "describing")
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
-    """(1, C, h, w), (1, W, h, w) and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
-    h, w = cells
+    """As `describing`, from the trunk's maps: (1, C, h, w), (1, W, h, w) and (1, 1, h, w)."""
+    features = ops.parameter([1, model.trunk.channels, *cells], np.float32)
+    wide = ops.parameter([1, model.trunk.width, *cells], np.float32)
+    counted = ops.parameter([1, 1, *cells], np.float32)
+    return ov.Model(_described(model, features, wide, counted, windows), [features, wide, counted], "head")
+
+
+def trunk_maps(model: Model, size: tuple[int, int]) -> ov.Model:
+    """(1, H, W, 3) uint8 -> the trunk's maps, and those before its neck where it has one."""
+    pixels, features, wide = _maps(model, size)
+    return ov.Model([features, wide] if model.trunk.neck else [wide], [pixels], "trunk")
+
+
+def _maps(model: Model, size: tuple[int, int]) -> tuple[Node, Node, Node]:
+    """The graph's input, the trunk's maps, and those before its neck."""
+    trunk, weights = model.trunk, model.part("trunk")
+    pixels, images = image_input(*size)
+    wide = build(trunk.layers, weights, images)
+    return pixels, build(trunk.neck, weights, wide), wide
+
+
+def _described(model: Model, features: Node, wide: Node, counted: Node, windows: Windows) -> list[Node]:
+    """What follows the trunk."""
     centroids = model.tensors["netvlad.centroids"]
-    c = centroids.shape[1]
-    features = ops.parameter([1, c, h, w], np.float32)
-    wide = ops.parameter([1, model.trunk.width, h, w], np.float32)
-    counted = ops.parameter([1, 1, h, w], np.float32)
+    _, c, h, w = features.output(0).shape
     x = ops.reshape(_unit(features, 1), integers(c, h * w), False)
     logits = ops.matmul(constant(model.tensors["netvlad.assignment"]), x, False, False)  # (K, N)
     weights = ops.multiply(ops.softmax(logits, 0), ops.reshape(counted, integers(1, h * w), False))
     vector = _global_vector(model, x, weights, wide, counted)
-    scales = _scales(centroids, x, weights, cells, windows)
-    patches = _patches(model, x, weights, scales, cells, windows)
-    return ov.Model([vector, *patches], [features, wide, counted], "head")
+    scales = _scales(centroids, x, weights, (h, w), windows)
+    return [vector, *_patches(model, x, weights, scales, (h, w), windows)]
 
 
 def _unit(x: Node, axis: int) -> Node:

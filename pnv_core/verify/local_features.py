@@ -134,6 +134,8 @@ def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float
 class RootSIFTVerifier:
     """RootSIFT of small pictures, the latest features kept; neighbouring queries meet the same candidates."""
 
+    side = WIDTH
+
     def __init__(self) -> None:
         self._features: OrderedDict[bytes, LocalFeatures] = OrderedDict()
         self._valid: dict[str, NDArray[np.bool_]] = {}

@@ -34,6 +34,8 @@ class EpipolarCheck:
 class Verifier(Protocol):
     """Compares two images by what it kept of each: a picture or features, as bytes that go into the map."""
 
+    side: int  # pixels it looks at along the longer side of an image; more tell it nothing
+
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
         """(H, W, 3) uint8, optionally (H, W) bool of the pixels to use -> what is kept of the image."""
         ...

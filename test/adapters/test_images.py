@@ -180,6 +180,21 @@ def test_a_truncated_file_is_refused_and_not_filled_with_grey(extension):
             rgb(compressed(data[: int(share * len(data))]))
 
 
+def test_a_jpeg_is_decoded_at_the_fraction_that_is_enough():
+    picture = cv2.resize(noise(4, 45, 80, 3), (1280, 720), interpolation=cv2.INTER_CUBIC)
+    message = compressed(cv2.imencode(".jpg", picture[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+    for enough, shape in (
+        ((1280, 720), (720, 1280)), ((641, 288), (720, 1280)), ((640, 288), (360, 640)), ((200, 180), (180, 320))
+    ):  # fmt: skip
+        small = message_to_frame(message, "camera", enough).rgb
+        assert small.shape[:2] == shape
+        averaged = cv2.resize(picture, shape[::-1], interpolation=cv2.INTER_AREA)
+        assert np.abs(small.astype(int) - averaged).mean() < 2.0
+    cut = compressed(message.data[: len(message.data) // 2])
+    with pytest.raises(ImageError, match="cannot be decoded"):
+        message_to_frame(cut, "camera", (640, 288))
+
+
 def test_other_formats_are_refused_by_name():
     with pytest.raises(ImageError, match="is a depth image; allowed: jpeg, png"):
         rgb(compressed(bytes(100), "16UC1; compressedDepth png"))

@@ -13,7 +13,8 @@ import torch.nn.functional as F
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pnv_core import load_describer
+from pnv_core import KeyframeDatabase, MapStore, load_describer
+from pnv_core.describe.describer import resized
 from pnv_core.describe.model_files import ModelInfo, build_model
 from pnv_core.describe.openvino_describing import head
 from pnv_core.describe.patches import patch_descriptors
@@ -177,6 +178,14 @@ def test_halves_are_unpacked_to_the_bit():
     assert np.array_equal(patch_rows(finite).view(np.uint32), finite.astype(np.float32).view(np.uint32))
 
 
+@pytest.mark.parametrize("given", [(480, 640), (720, 1280), (479, 641), (240, 320), (1080, 1920)])
+def test_rows_shared_out_are_resized_as_all_at_once(given):
+    image = np.random.default_rng(7).integers(0, 256, (*given, 3), np.uint8)
+    for width, height in ((384, 288), (320, 240)):
+        for threads in (2, 3):
+            assert np.array_equal(resized(image, width, height, workers(threads)), resized(image, width, height))
+
+
 @pytest.mark.parametrize("settings", [{}, {"image_width": 650, "image_height": 490, "patch_sizes": (2, 5)}])
 def test_both_backends_describe_alike(settings):
     """Whatever the size, with a mask or without."""
@@ -198,11 +207,39 @@ def test_a_bfloat16_trunk_describes_alike(backend):
     if "BF16" not in fast_precisions():
         pytest.skip("the processor has no bfloat16 products")
     image = cv2.resize(np.random.default_rng(6).integers(0, 256, (30, 40, 3), np.uint8), (320, 240))
-    one, other = load_describer(backend=backend), load_describer(backend=backend, trunk_precision="bfloat16")
+    one, other = (load_describer(backend=backend, trunk_precision=p) for p in ("float32", "bfloat16"))
     a, b = one.describe(image), other.describe(image)
     assert 1 - a.global_vector @ b.global_vector < 3e-2
     assert not np.array_equal(a.global_vector, b.global_vector)
     assert one.fingerprint == other.fingerprint
+
+
+@pytest.mark.parametrize("order", [("float32", "bfloat16"), ("bfloat16", "float32")])
+def test_a_map_saved_in_one_precision_serves_in_the_other(tmp_path, order):
+    if "BF16" not in fast_precisions():
+        pytest.skip("the processor has no bfloat16 products")
+    saving, loading = (load_describer(trunk_precision=precision) for precision in order)
+    grids = [(4, 3), (16, 12), (64, 48)]
+    places = [
+        sum(cv2.resize(random.integers(0, 86, (h, w, 3), np.uint8), (384, 288)) for w, h in grids)
+        for random in map(np.random.default_rng, range(8))
+    ]
+    database = KeyframeDatabase.for_describer(saving)
+    for number, picture in enumerate(places):
+        database.add(number * 10**9, "camera", saving.describe(picture))
+    MapStore(tmp_path / "map", saving.map_fingerprint).save(database.snapshot())
+    loaded = KeyframeDatabase.for_describer(loading)
+    MapStore(tmp_path / "map", loading.map_fingerprint).load(loaded)
+    for number, picture in enumerate(places):
+        described = loading.describe(picture)
+        (match, cosine), (_, second) = loaded.nearest(described.global_vector, 2, 10**12, 0)
+        assert match.id == number
+        assert 1 - cosine < 0.02 < 1 - second  # of another place it is 0.3 and more
+        (query,), (stored,) = described.patches, loaded.descriptor(number).patches
+        own = (query.descriptors * stored.descriptors.astype(np.float32)).sum(1)
+        assert np.median(1 - own) < 0.02
+        matched, reference = mutual_nearest(query.descriptors, stored.descriptors)
+        assert np.mean(matched == reference) > 0.9
 
 
 def test_what_was_compiled_and_damaged_is_compiled_again(tmp_path, monkeypatch):

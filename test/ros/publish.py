@@ -1,4 +1,4 @@
-"""A camera: publishes images from files or noise with given stamps, as a process of its own.
+"""Cameras: publish images from files or noise with given stamps, as a process of its own.
 
 python -m test.ros.publish --topic camera/image_raw --stamps STAMPS.csv --rate 10
 The CSV has one row per image: nanoseconds, path (empty: seeded noise).
@@ -37,7 +37,7 @@ def image_message(bgr: np.ndarray, encoding: str) -> Image | CompressedImage:
 
 def main() -> int:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--topic", default="camera/image_raw")
+    parser.add_argument("--topic", default="camera/image_raw", help="or several, with commas")
     parser.add_argument("--stamps", required=True)
     parser.add_argument("--rate", type=float, default=10.0)
     parser.add_argument("--encoding", default="bgr8")  # of ENCODINGS, or jpeg, png
@@ -51,9 +51,10 @@ def main() -> int:
     node = rclpy.create_node("camera_driver")
     reliability = QoSReliabilityPolicy.RELIABLE if args.reliable else QoSReliabilityPolicy.BEST_EFFORT
     kind = Image if args.encoding in ENCODINGS else CompressedImage
-    publisher = node.create_publisher(kind, args.topic, QoSProfile(depth=5, reliability=reliability))
+    qos = QoSProfile(depth=5, reliability=reliability)
+    publishers = [node.create_publisher(kind, topic, qos) for topic in args.topic.split(",")]
     give_up = time.monotonic() + 30
-    while not publisher.get_subscription_count():
+    while not all(publisher.get_subscription_count() for publisher in publishers):
         if time.monotonic() > give_up:
             print("nobody listens", file=sys.stderr)
             return 1
@@ -70,7 +71,8 @@ def main() -> int:
             noise = np.random.default_rng(number).integers(0, 256, (height, width, 3), dtype=np.uint8)
             message = image_message(cv2.imread(path) if path else noise, args.encoding)
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-        publisher.publish(message)
+        for publisher in publishers:
+            publisher.publish(message)
         due += 1.0 / args.rate
         time.sleep(max(0.0, due - time.monotonic()))
     time.sleep(args.linger)
