@@ -229,8 +229,9 @@ def _targets(args: argparse.Namespace) -> Targets:
         raise ConfigError("--localize finds the places of a map; allowed: together with --load-map DIR")
     if args.save_map == "" and folder is None:
         raise ConfigError("--save-map needs a folder; allowed: --save-map DIR, or together with --out DIR")
-    named = {name: writable(value) for name in _FILES if (value := getattr(args, name))}
-    if folder:
+    asked = {name: Path(value) for name in _FILES if (value := getattr(args, name))}
+    named = {name: path if path.parent == folder else writable(path) for name, path in asked.items()}
+    if folder:  # it is made when everything else is known to be right
         named = {"csv": folder / "closures.csv", "report": folder / "report.html"} | named
         (folder.parent).mkdir(parents=True, exist_ok=True)
         writable(folder.parent / "x" if not folder.exists() else folder / "x")

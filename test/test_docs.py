@@ -36,6 +36,7 @@ ELSEWHERE = (
     "chromium",
     "python",
     "python3",
+    "rerun",
 )
 NEEDS_NETWORK = ("pnv weights fetch", "pnv doctor")  # the doctor also needs a middleware of its own; tested elsewhere
 BLOCK = re.compile(r"^```(\w+)[^\n]*\n(.*?)^```", re.M | re.S)
