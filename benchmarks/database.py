@@ -3,6 +3,7 @@
     nice python benchmarks/database.py retrieval --rows 100000 --index exact pq
     nice python benchmarks/database.py retrieval --rows 1000000 --index exact pq
     nice python benchmarks/database.py saving --keyframes 10000
+    nice python benchmarks/database.py stalls --keyframes 11000
     nice python benchmarks/database.py footprint
 
 Vectors are random, or those of a robot that drives the same closed course of places in many laps, each under its own
@@ -174,9 +175,77 @@ def _frames(
     return np.array(took)
 
 
-def _waited_for_processor() -> float:
-    """Seconds this thread has been ready to run while others ran (Linux schedstat): load of the machine, not ours."""
-    return int(Path("/proc/thread-self/schedstat").read_text().split()[1]) / 1e9
+def _waited_for_processor(thread: int | str = "") -> float:
+    """Seconds a thread, this one by default, has been ready to run while others ran (Linux schedstat).
+
+    That is the load of the machine, not ours.
+    """
+    which = f"self/task/{thread}" if thread else "thread-self"
+    return int(Path(f"/proc/{which}/schedstat").read_text().split()[1]) / 1e9
+
+
+class Ticks:
+    """A thread that wants to run every millisecond, as a callback would: the longest it had to wait, in ms.
+
+    `longest` is by the clock; `longest_own` leaves out what it and the thread that made it waited for a processor.
+    """
+
+    def __init__(self) -> None:
+        self.longest = self.longest_own = 0.0
+        self._worker, self._ended = threading.get_native_id(), threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def _run(self) -> None:
+        at, waited = time.perf_counter(), self._waited()
+        while not self._ended.is_set():
+            time.sleep(0.001)
+            now, now_waited = time.perf_counter(), self._waited()
+            self.longest = max(self.longest, (now - at) * 1e3)
+            self.longest_own = max(self.longest_own, (now - at - (now_waited - waited)) * 1e3)
+            at, waited = now, now_waited
+
+    def _waited(self) -> float:
+        return _waited_for_processor() + _waited_for_processor(self._worker)
+
+    def __enter__(self) -> "Ticks":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+
+def stalled(keyframes: int, folder: Path, dim: int = 512) -> dict[str, Ticks]:
+    """How long callbacks wait while a map of about 89 kB a keyframe is saved, read, put in place and let go."""
+    rng = np.random.default_rng(0)
+    places = [place(rng, dim, 676) for _ in range(64)]
+    database = KeyframeDatabase(dim, keyframes * 0.11)
+    for i in range(keyframes):
+        database.add(i * SECOND, "front", places[i % 64])
+    store, found = MapStore(folder / "map", "0" * 16), {}
+    with Ticks() as found["saved"]:
+        store.save(database.snapshot())
+    with Ticks() as found["read"]:
+        manifest, prepared = store.read(database)
+    with Ticks() as found["put in place"]:
+        store.put(database, manifest, prepared)
+    del prepared
+    with Ticks() as found["forgotten"]:
+        database.clear()
+    return found
+
+
+def stalls(args: argparse.Namespace) -> None:
+    """The longest a thread waits that wants to run every millisecond, while a map is saved and loaded."""
+    folder = Path(tempfile.mkdtemp(prefix="map-", dir=args.folder))
+    try:
+        found = stalled(args.keyframes, folder, args.dim)
+        size = sum(file.stat().st_size for file in (folder / "map").iterdir()) / 1e6
+    finally:
+        shutil.rmtree(folder)
+    for what, ticks in found.items():
+        print(f"{size:.0f} MB {what}: {ticks.longest:.1f} ms, {ticks.longest_own:.1f} without the load of the machine")
 
 
 def _report(what: str, took: NDArray) -> None:
@@ -202,7 +271,7 @@ def footprint(args: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("retrieval", "saving", "footprint"))
+    parser.add_argument("what", choices=("retrieval", "saving", "stalls", "footprint"))
     parser.add_argument("--rows", type=int, nargs="+", default=[100_000])
     parser.add_argument("--kind", nargs="+", choices=("random", "trajectory"), default=["random", "trajectory"])
     parser.add_argument("--index", nargs="+", default=["exact", "pq"])
@@ -212,7 +281,7 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=20.0, help="frames per second")
     parser.add_argument("--folder", default="/var/tmp", help="where the map is saved")
     args = parser.parse_args()
-    {"retrieval": retrieval, "saving": saving, "footprint": footprint}[args.what](args)
+    {"retrieval": retrieval, "saving": saving, "stalls": stalls, "footprint": footprint}[args.what](args)
 
 
 if __name__ == "__main__":

@@ -87,14 +87,14 @@ class Targets:
 
 
 def run(args: argparse.Namespace) -> int:
-    from pnv_core.decide.calibration import CONSERVATIVE
+    from pnv_core.decide.calibration import why_conservative
 
     targets, poses = _targets(args), _poses(args)
     config = config_from(args)
     source = source_of(args)
     recognizer = _recognizer(args, config)
-    if recognizer.judge.calibration is CONSERVATIVE:
-        print("pnv: no calibration fits this model and these settings: a conservative score decides", file=sys.stderr)
+    if why := why_conservative(recognizer.describer.model.info.calibration, recognizer.describer.config):
+        print(f"pnv: {why}", file=sys.stderr)
     if targets.folder:
         targets.folder.mkdir(parents=True, exist_ok=True)
     with ExitStack() as open_until_the_end:

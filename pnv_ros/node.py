@@ -12,6 +12,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
 from pnv_core.database import KeyframeDatabase
+from pnv_core.decide.calibration import why_conservative
 from pnv_core.describe.describer import Describer, describer_from
 from pnv_core.errors import ConfigError, MapError, PnvError
 from pnv_core.maps import Autosave, SaveReport
@@ -188,6 +189,8 @@ class PlaceRecognizerNode(LifecycleNode):
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
         poses.offsets = dict(zip(config.image_topics, _triples(config.camera_in_base), strict=False))
         self._companions = Companions(self, config, views, poses, recognizer.odometry, outputs.markers.track)
+        if why := why_conservative(describer.model.info.calibration, describer.config):
+            self.get_logger().warning(why)
         self._map = SavedMap(database, describer.map_fingerprint)
         self._map.path = config.map_path
         if config.autosave and not config.load_on_start and self._map.exists():

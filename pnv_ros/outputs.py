@@ -20,6 +20,7 @@ from pnv_core.drawing import draw_match
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
 from pnv_core.verify.feature_codes import packed
+from pnv_core.verify.local_features import decoded
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
 
@@ -114,4 +115,4 @@ class Outputs:
     def _unpacked(self, picture: bytes) -> NDArray[np.uint8]:
         if not picture or packed(picture):
             return np.full((self._size[1], self._size[0], 3), 64, np.uint8)
-        return cv2.cvtColor(cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE), cv2.COLOR_GRAY2RGB)
+        return cv2.cvtColor(decoded(picture), cv2.COLOR_GRAY2RGB)

@@ -1,5 +1,6 @@
 """The executable `place_recognizer`: one node, ended by SIGINT, SIGTERM or its own failure."""
 
+import gc
 import re
 import signal
 import sys
@@ -94,6 +95,8 @@ def main(args: list[str] | None = None) -> int:
             return UNUSABLE_INPUT
         if node.settings.node.autostart and not node.start():
             return UNUSABLE_INPUT
+        gc.collect()
+        gc.freeze()  # libraries and the model stay: no later collection walks them, which would hold callbacks up
         spinning = Spinning(node, ending)
         end = ending.get()
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -24,10 +24,13 @@ def tally(item: str, tried: int, survived: int, lost: int = 0) -> None:
 
 
 def main() -> None:
-    rows = sorted(json.loads(line) for line in Path(sys.argv[1]).read_text().splitlines())
+    sums: dict[str, list[int]] = {}
+    for line in Path(sys.argv[1]).read_text().splitlines():
+        item, *counts = json.loads(line)
+        sums[item] = [a + b for a, b in zip(sums.get(item, (0, 0, 0)), counts, strict=True)]
     print("| item | tried | survived | lost |\n|---|---|---|---|")
-    for row in rows:
-        print("| " + " | ".join(f"{n:,}" if isinstance(n, int) else n for n in row) + " |")
+    for item in sorted(sums):
+        print(f"| {item} | " + " | ".join(f"{n:,}" for n in sums[item]) + " |")
 
 
 if __name__ == "__main__":

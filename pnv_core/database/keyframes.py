@@ -3,6 +3,7 @@
 import copy
 import logging
 import threading
+import time
 from bisect import bisect_left
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -17,9 +18,11 @@ from pnv_core.database.patch_codes import (
     DTYPES,
     GridLayout,
     PatchCodes,
+    Shapes,
     buffer_bytes,
     encode,
     layout_of,
+    shapes_of,
     views,
 )
 from pnv_core.database.patch_file import DiskBuffer, PatchFile
@@ -136,6 +139,7 @@ class KeyframeDatabase:
         patch_folder: str = "",
         disk_budget_gb: float = 32.0,
         cell: int = 16,
+        shapes: Shapes | None = None,
     ) -> None:
         if patch_precision not in DTYPES:
             allowed = ", ".join(DTYPES)
@@ -144,6 +148,7 @@ class KeyframeDatabase:
             raise ConfigError(f"patch_store = {patch_store!r} is out of range; allowed: one of memory, disk")
         self.dim = dim
         self.cell = cell
+        self.shapes = shapes  # of the patches of every keyframe; None: any
         self.bytes_budget = int(memory_budget_mb * MB)
         self.patch_precision = patch_precision
         self.read_only = read_only
@@ -177,10 +182,11 @@ class KeyframeDatabase:
     @classmethod
     def for_describer(cls, describer: "Describer", *, read_only: bool = False) -> "KeyframeDatabase":
         """An empty database for what this describer gives, with the memory settings of its Config."""
-        config = describer.config
+        config, depth = describer.config, describer.model.patch_dim
         return cls(
             describer.model.global_dim,
             cell=describer.cell,
+            shapes=tuple((size, rows, cols, stride, depth) for size, stride, rows, cols in describer.grids()),
             memory_budget_mb=config.memory_budget_mb,
             eviction=config.eviction,
             index=config.index,
@@ -476,6 +482,11 @@ class KeyframeDatabase:
         return lineage
 
     def _take_back(self, kf: KeyframeRecord, count: int) -> None:
+        if self.shapes is not None and shapes_of(kf.layouts) != self.shapes:
+            raise PnvError(
+                f"keyframe {kf.ref.id} has patches of size, rows, columns, stride and dimensions "
+                f"{shapes_of(kf.layouts)}; allowed: {self.shapes}, as this model's"
+            )
         buffer = np.frombuffer(kf.read(), np.uint8)
         while self._bytes_with(1) + len(buffer) > self.bytes_budget:
             if not self._spill():
@@ -490,6 +501,8 @@ def _let_go(keyframes: dict[int, StoredKeyframe]) -> None:
     """Free keyframes one by one, so that no thread waits for all of them at once."""
     while keyframes:
         keyframes.popitem()
+        if len(keyframes) % 64 == 0:
+            time.sleep(0)  # lets go of Python's lock
 
 
 def _unit_vector(vector: NDArray, dim: int) -> NDArray[np.float32]:

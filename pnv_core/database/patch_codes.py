@@ -12,7 +12,11 @@ from numpy.typing import NDArray
 
 from pnv_core.types import PatchGrid
 
+Shapes = tuple[tuple[int, int, int, int, int], ...]  # (size, rows, cols, stride, D) per patch size
+
 DTYPES: dict[str, np.dtype] = {"float32": np.dtype("<f4"), "float16": np.dtype("<f2"), "int8": np.dtype("i1")}
+# The bits of 2.0 by width: no value of a unit row is larger, and as whole numbers infinity and NaN lie above.
+_LARGEST = {2: np.int16(0x4000), 4: np.int32(0x40000000)}
 _ALIGN = 64  # bytes: every array in a buffer starts on a cache line, as SIMD loads want it
 
 
@@ -94,6 +98,21 @@ def _padded(nbytes: int) -> int:
 def buffer_bytes(layouts: tuple[GridLayout, ...]) -> int:
     """Bytes of the buffer of one keyframe."""
     return layouts[-1].end if layouts else 0
+
+
+def shapes_of(layouts: tuple[GridLayout, ...]) -> Shapes:
+    """What `layout_of_shapes` made these of."""
+    return tuple((g.size, g.rows, g.cols, g.stride, g.dim) for g in layouts)
+
+
+def plausible(buffer: NDArray[np.uint8], layouts: tuple[GridLayout, ...]) -> bool:
+    """Whether every stored value is finite and no larger than one of a unit row can be; int8 by its scales."""
+    for view in views(buffer, layouts):
+        values = view.codes if view.scales is None else view.scales
+        bits = values.view(f"<i{values.itemsize}") & (0x7FFF if values.itemsize == 2 else 0x7FFFFFFF)
+        if bits.size and bits.max() > _LARGEST[values.itemsize]:
+            return False
+    return True
 
 
 def encode(grids: tuple[PatchGrid, ...], layouts: tuple[GridLayout, ...]) -> NDArray[np.uint8]:

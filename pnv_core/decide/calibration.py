@@ -9,8 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import safe_open
@@ -48,16 +49,38 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
 _VALUES = _FEATURES["patches"] | _FEATURES["verified"]
 
 
+# bounds of what a file may say
+_Number = Annotated[float, msgspec.Meta(ge=0.0, le=1e6)]
+_Whole = Annotated[int, msgspec.Meta(ge=0, le=10_000)]
+_Text = Annotated[str, msgspec.Meta(max_length=10_000)]
+
+
 @dataclass(frozen=True)
 class Logistic:
     """P = 1 / (1 + exp(-(bias + sum of weight * feature))), weights by feature name, none negative."""
 
-    bias: float
-    weights: dict[str, float]
+    bias: Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
+    weights: dict[str, _Number]
 
     def probability(self, evidence: Evidence) -> float:
         logit = self.bias + sum(weight * _VALUES[name](evidence) for name, weight in self.weights.items())
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
+
+
+@dataclass(frozen=True)
+class _Written:
+    """A calibration as a model file holds it."""
+
+    patches: Logistic
+    verified: Logistic
+    scorer: _Text
+    patch_sizes: tuple[_Whole, ...]
+    image_size: tuple[_Whole, _Whole]
+    source: _Text
+    patch_strides: tuple[_Whole, ...] = ()
+    patch_weights: tuple[_Number, ...] = ()
+    scale_weight: _Number = 0.3
+    verifier: _Text = "rootsift"
 
 
 @dataclass(frozen=True)
@@ -85,10 +108,14 @@ class Calibration:
 
     def suits(self, config: Config) -> bool:
         """Whether it was fitted with the settings of a completed Config that shape the evidence."""
+        return not self.differences(config)
+
+    def differences(self, config: Config) -> dict[str, Any]:
+        """The settings by name that it was fitted with and that a completed Config has otherwise."""
         own = _evidence_settings(config)
         strides = self.patch_strides or (1,) * len(self.patch_sizes)
         fitted = replace(self, patch_strides=strides, patch_weights=self.patch_weights or own["patch_weights"])
-        return all(getattr(fitted, name) == value for name, value in own.items())
+        return {name: getattr(fitted, name) for name, value in own.items() if getattr(fitted, name) != value}
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -97,23 +124,15 @@ class Calibration:
     def from_json(cls, given: dict[str, Any]) -> "Calibration":
         """Raises ModelError for anything but what `to_json` writes."""
         try:
-            models: dict[str, Any] = {}
-            for name, features in _FEATURES.items():
-                weights = {str(k): float(v) for k, v in given[name]["weights"].items()}
-                bias = float(given[name]["bias"])
-                wrong = sorted(set(weights) - set(features))
-                if wrong or not all(0 <= w < math.inf for w in weights.values()) or not math.isfinite(bias):
-                    allowed = ", ".join(features)
-                    raise ModelError(f"calibration.{name} = {given[name]}; allowed: weights >= 0 of {allowed}")
-                models[name] = Logistic(bias, weights)
-            width, height = given["image_size"]
-            sizes = tuple(int(size) for size in given["patch_sizes"])
-            later: dict[str, Any] = {name: given[name] for name in ("scale_weight", "verifier") if name in given}
-            later |= {name: tuple(given.get(name, ())) for name in ("patch_strides", "patch_weights")}
-            return cls(**models, scorer=given["scorer"], patch_sizes=sizes, image_size=(int(width), int(height)),
-                       source=str(given["source"]), **later)  # fmt: skip
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise ModelError(f"calibration is incomplete or malformed ({error!r}); refit: pnv calibrate") from None
+            written = msgspec.convert(given, _Written)
+        except (msgspec.ValidationError, RecursionError) as error:
+            raise ModelError(f"calibration is incomplete or malformed ({error}); refit: pnv calibrate") from None
+        for name, features in _FEATURES.items():
+            model: Logistic = getattr(written, name)
+            if set(model.weights) - set(features) or not np.isfinite([model.bias, *model.weights.values()]).all():
+                allowed = ", ".join(features)
+                raise ModelError(f"calibration.{name} = {given[name]}; allowed: weights >= 0 of {allowed}")
+        return cls(**vars(written))
 
 
 # For models without a calibration of their own. The patch part never passes 0.5: patch scores of an unknown model have
@@ -131,6 +150,15 @@ def calibration_for(stored: dict[str, Any] | None, config: Config) -> Calibratio
         return CONSERVATIVE
     calibration = Calibration.from_json(stored)
     return calibration if calibration.suits(config) else CONSERVATIVE
+
+
+def why_conservative(stored: dict[str, Any] | None, config: Config) -> str:
+    """Why the conservative calibration decides, in words; empty where the model's own does."""
+    if stored is None:
+        return "the model has no calibration (pnv calibrate makes one): a conservative score decides"
+    other = Calibration.from_json(stored).differences(config)
+    fitted = ", ".join(f"{name} = {value}" for name, value in other.items())
+    return f"the model's calibration is for {fitted}: a conservative score decides" if other else ""
 
 
 def write_calibration(path: Path | str, calibration: Calibration) -> None:

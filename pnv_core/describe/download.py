@@ -8,6 +8,7 @@ import http.client
 import json
 import os
 import shutil
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -21,6 +22,7 @@ DEFAULT_MODEL = Path(__file__).parents[1] / "models" / "default.safetensors"
 _BASE_URL = "https://huggingface.co/TobiasRobotics/Patch-NetVLAD/resolve/main/"
 _CHUNK = 1 << 20
 _TIMEOUT_S = 30
+_PATIENCE_S, _LEAST_BYTES = 60.0, 100_000  # so much must come in so long, else the largest file would take days
 _MOST_BYTES = 2_500_000_000  # the largest published file takes 0.6 GB, in float64 1.2 GB
 
 
@@ -163,10 +165,18 @@ def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int
                 if free < length:
                     raise ModelError(f"{part.parent} has {free >> 20} MB free; {length >> 20} MB are needed")
             done = have if resumed else 0
+            since, then = time.monotonic(), done
             with part.open("ab" if resumed else "wb") as out:
-                while chunk := answer.read(_CHUNK):
+                while chunk := answer.read1(_CHUNK):  # what is there; `read` would wait for all of it
                     out.write(chunk)
                     done += len(chunk)
+                    if time.monotonic() - since > _PATIENCE_S:
+                        if done - then < _LEAST_BYTES:
+                            raise ModelError(
+                                f"{url}: only {done - then} bytes came in {_PATIENCE_S:g} s; run the command again to "
+                                "resume"
+                            )
+                        since, then = time.monotonic(), done
                     if done > _MOST_BYTES:
                         raise ModelError(f"{url}: more than {_MOST_BYTES} bytes came; delete {part} to begin anew")
                     progress(done, total)

@@ -40,7 +40,7 @@ class OpenMap:
             if not holds(segment.live, kf.ref.id):
                 continue
             if not kf.sound:
-                raise MapError(f"{path}: the vector of keyframe {kf.ref.id} has not the length 1")
+                raise MapError(f"{path}: keyframe {kf.ref.id} has values that no describer gives")
             if kf.ref.camera not in manifest.cameras or kf.ref.session >= manifest.next_session:
                 raise MapError(f"{path}: camera or session of keyframe {kf.ref.id} is not of this map")
             yield kf

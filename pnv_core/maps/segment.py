@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.database.keyframes import KeyframeRecord
-from pnv_core.database.patch_codes import GridLayout, buffer_bytes, layout_of_shapes
+from pnv_core.database.patch_codes import GridLayout, buffer_bytes, layout_of_shapes, plausible
 from pnv_core.errors import MapError
 from pnv_core.files import open_regular
 from pnv_core.types import ImageRef
@@ -73,8 +73,9 @@ class SavedKeyframe:
 
     @property
     def sound(self) -> bool:
-        """Whether the vector is one that a describer gives: of length 1. A checksum says nothing about that."""
-        return abs(float(np.linalg.norm(self.vector.astype(np.float64))) - 1.0) < 1e-2
+        """Whether a describer may give this: a vector of length 1, patches of such values. No checksum says so."""
+        length = float(np.linalg.norm(self.vector.astype(np.float64)))
+        return abs(length - 1.0) < 1e-2 and plausible(self.buffer, self.layouts)
 
 
 @dataclass(frozen=True)

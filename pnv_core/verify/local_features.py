@@ -3,6 +3,7 @@
 N = features of an image, M = matches.
 """
 
+import io
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from pnv_core.threads import Workers
 from pnv_core.verify.feature_codes import pack, packed, unpack
@@ -43,9 +45,17 @@ def thumbnail(rgb: NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
 
 
-def _decoded(picture: bytes) -> NDArray[np.uint8]:
-    """(h, w) grey; a damaged picture shows nothing."""
-    grey: Any = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE)
+def decoded(picture: bytes) -> NDArray[np.uint8]:
+    """(h, w) grey of a thumbnail; one that is damaged, or larger than `thumbnail` makes them, shows nothing.
+
+    It may come from a map that somebody else wrote, so its sides are read before it is unpacked.
+    """
+    try:
+        with Image.open(io.BytesIO(picture), formats=("JPEG",)) as header:
+            small = header.width <= WIDTH and header.height <= _TALLEST
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        small = False
+    grey: Any = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_GRAYSCALE) if small else None
     return np.zeros((WIDTH, WIDTH), np.uint8) if grey is None else grey
 
 
@@ -61,7 +71,7 @@ def detect(picture: bytes, valid: NDArray[np.bool_] | None = None) -> LocalFeatu
     """
     if packed(picture):
         return _unpacked(picture)
-    grey = _decoded(picture)
+    grey = decoded(picture)
     if grey.shape[1] < WIDTH:  # a small image has details of few pixels; SIFT wants them larger
         grey = cv2.resize(grey, (WIDTH, _height(grey)), interpolation=cv2.INTER_LINEAR)
     mask = None
@@ -99,7 +109,7 @@ def _aspect(picture: bytes) -> float:
             return unpack(picture)[2]
         except ValueError:
             return 1.0
-    height, width = _decoded(picture).shape
+    height, width = decoded(picture).shape
     return height / width
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from msg_adapters.camera_info import Rectifier
 from pnv_core.errors import ImageError
-from test.tally import count
+from test.tally import count, tally
 
 K = [300.0, 0.0, 160.0, 0.0, 300.0, 120.0, 0.0, 0.0, 1.0]
 
@@ -79,6 +79,7 @@ NUMBERS = st.floats() | st.sampled_from([0.0, 1.0, 300.0, 1e-300, 1e300, -1.0, 1
 @settings(max_examples=count(150, 10_000), deadline=None, database=None)
 def test_no_camera_info_turns_an_image_black(numbers, d, rectified, model, kept):
     """What is accepted shows at least a tenth of the image."""
+    tally("4 camera infos of any numbers", 1, 1)
     k = [own if i < kept else other for i, (own, other) in enumerate(zip(K, numbers, strict=True))]
     try:
         rectifier = Rectifier(info(d, model, k=k), rectified=rectified)

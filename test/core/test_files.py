@@ -7,7 +7,9 @@ import shutil
 import socket
 import tempfile
 import threading
+import time
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -236,6 +238,31 @@ def test_an_answer_that_is_no_model_is_refused_in_one_line_and_not_remembered(ki
     tally("9 answers of a server that are no model", 1, 1)
 
 
+@pytest.mark.parametrize(("pause", "words"), [(0.02, "bytes came in 0.5 s; run the command again"), (0, "more than")])
+def test_a_body_without_end_is_given_up_be_it_slow_or_fast(pause, words, monkeypatch, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def answer():
+            connection, _ = listening.accept()
+            with connection, suppress(OSError):
+                connection.recv(4096)
+                connection.sendall(b"HTTP/1.1 200 OK\r\n\r\n")
+                while True:
+                    connection.sendall(bytes(1 if pause else 100_000))
+                    time.sleep(pause)
+
+        threading.Thread(target=answer, daemon=True).start()
+        monkeypatch.setattr(published, "_BASE_URL", f"http://127.0.0.1:{listening.getsockname()[1]}/")
+        monkeypatch.setattr(published, "_PATIENCE_S", 0.5)
+        monkeypatch.setattr(published, "_MOST_BYTES", 50_000_000)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+        with pytest.raises(ModelError, match=words) as refused:
+            published.fetch("mapillary_WPCA128")
+    assert "\n" not in str(refused.value)
+    assert not published.PUBLISHED["mapillary_WPCA128"].path.exists()
+    tally("9 answers without end", 1, 1)
+
+
 def test_an_archive_that_unpacks_to_more_than_it_is_is_refused_before(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.pth", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("archive/data.pkl", bytes(50_000_000))
@@ -270,6 +297,7 @@ def test_metadata_of_a_model_that_says_other_things_is_refused_in_one_line(chang
         assert len(str(error)) <= 1000
     finally:
         shutil.rmtree(folder)
+    tally("8 models whose metadata says other things", 1, 1)
 
 
 def test_a_download_is_placed_whole_and_its_hash_recorded(server, tmp_path):

@@ -17,12 +17,15 @@ from pnv_core.decide.calibration import (
     fit_calibration,
     reliability,
     threshold_for_precision,
+    why_conservative,
     write_calibration,
 )
 from pnv_core.describe.model_files import load_model, save_model
 from pnv_core.errors import ModelError
 from pnv_core.types import Evidence
 from test.core.small import small_model
+from test.edited_json import edited
+from test.tally import count, tally
 
 CONFIG = Config.make(
     image_width=320, image_height=240, patch_sizes=(2, 3), patch_strides=(1, 1), patch_weights=(0.5, 0.5)
@@ -168,3 +171,33 @@ def test_a_malformed_calibration_is_refused(change):
     good = Calibration(Logistic(0.0, {}), Logistic(0.0, {}), "ransac", (2,), (320, 240), "").to_json()
     with pytest.raises(ModelError, match="calibration"):
         Calibration.from_json(good | change)
+
+
+def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilities_and_what_it_is_for_is_said():
+    right = Calibration(
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"local_inliers": 3.0}), "ransac", (2, 3), (320, 240), "a test"
+    )
+    evidence = [e for e, _, _ in drawn(np.random.default_rng(0), 20)]
+    outcome = {"refused": 0, "said": 0, "same": 0}
+
+    @settings(max_examples=count(200, 20_000), deadline=None, database=None)
+    @given(edited(json.loads(json.dumps(right.to_json()))))
+    def read(stored):
+        try:
+            calibration = calibration_for(stored, CONFIG)
+        except ModelError as error:
+            assert "\n" not in str(error)
+            assert len(str(error)) <= 1000
+            outcome["refused"] += 1
+            return
+        assert all(0 <= calibration.probability(e) <= 1 for e in evidence)
+        assert (calibration is CONSERVATIVE) == bool(why_conservative(stored, CONFIG))
+        outcome["said" if calibration is CONSERVATIVE else "same"] += 1
+
+    read()
+    tried = sum(outcome.values())
+    tally("8 calibrations with other content", tried, tried)
+    assert min(outcome.values()) > 0
+    assert why_conservative(None, CONFIG).startswith("the model has no calibration")
+    other = why_conservative(right.to_json(), CONFIG.replace(scorer="rapid"))
+    assert other == "the model's calibration is for scorer = ransac: a conservative score decides"

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pnv_core.decide.odometry import Odometry, Refusal
 from pnv_core.types import ImageRef
-from test.tally import count
+from test.tally import count, tally
 
 S = 1_000_000_000
 
@@ -93,6 +93,7 @@ def test_a_robot_that_trembles_while_it_stands_has_gone_no_way(seed, rate):
     assert driving.at(119 * S).travelled_m == pytest.approx(100 * 119 / 120, abs=0.5)
     standing.remember(last)
     assert standing.impossible(last, first, drift=0.1, slack_m=10.0, least_way_m=1.0)
+    tally("3 robots that tremble where they stand", 1, 1)
 
 
 WILD = st.floats() | st.sampled_from([1500.0, 1e308, -1e308, math.nan, math.inf, 1e7])
@@ -119,6 +120,7 @@ def test_single_samples_from_elsewhere_change_nothing(strays):
     assert theirs.xyz == mine.xyz
     assert theirs.travelled_m == pytest.approx(mine.travelled_m, abs=0.5) or theirs.travelled_m < mine.travelled_m
     assert math.isfinite(theirs.travelled_m)
+    tally("3 odometries with single samples from elsewhere", 1, 1)
 
 
 def test_odometry_that_is_initialised_elsewhere_starts_anew_and_says_what_it_refused():

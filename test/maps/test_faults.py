@@ -17,8 +17,7 @@ from pnv_core.errors import MapError
 from pnv_core.maps import Autosave, MapStore, tools
 from pnv_core.maps.manifest import read_manifest
 from test.maps.worlds import MODEL, contents, driven, go_on, on_disk, saved
-
-FULL = bool(os.environ.get("PNV_FULL_TESTS"))  # the counts of the acceptance figures instead of quick ones
+from test.tally import count, tally
 
 
 def _save_until_killed(path: Path, progress) -> None:
@@ -43,7 +42,7 @@ def _save_until_killed(path: Path, progress) -> None:
 
 @pytest.mark.process
 def test_a_kill_at_any_moment_leaves_the_last_saved_map_whole(tmp_path):
-    rounds = 200 if FULL else 15
+    rounds = count(15, 200)
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["test.maps.test_faults"])
     rng = random.Random(1)
@@ -66,7 +65,7 @@ def test_a_kill_at_any_moment_leaves_the_last_saved_map_whole(tmp_path):
         manifest = tools.verify(path)
         assert manifest.next_id > certain
         assert manifest.keyframes > 0
-    print(f"{rounds} kills over {saves} saves: every map whole, {len(on_disk(path))} keyframes in the last")
+    tally(f"1 kills while a map is saved ({saves} saves)", rounds, rounds)
 
 
 def _damage(folder: Path, older: Path, rng: random.Random) -> str:
@@ -109,7 +108,7 @@ def test_a_damaged_map_is_refused_by_name_or_loads_unchanged_and_recovers_what_i
     database = saved(whole, 30, 30, 20)
     truth = contents(database)
     refused = recovered = 0
-    for number in range(200 if FULL else 60):
+    for number in range(count(60, 200)):
         folder = tmp_path / str(number)
         shutil.copytree(whole, folder)
         what = _damage(folder, older, rng)
@@ -124,7 +123,9 @@ def test_a_damaged_map_is_refused_by_name_or_loads_unchanged_and_recovers_what_i
             assert len(loaded) == 0
             recovered += _recovered(folder, tmp_path / f"{number}-out", truth, what)
         shutil.rmtree(folder)
-    print(f"{refused} refused, {recovered} keyframes recovered of {refused * len(truth)}")
+    tried = count(60, 200)
+    tally("1 damaged maps", tried, tried)
+    tally("1 keyframes of damaged maps; lost: what the damage destroyed", refused * len(truth), recovered, refused * len(truth) - recovered)
     assert refused > 0
 
 
@@ -187,6 +188,7 @@ def test_a_full_disk_is_reported_recognition_goes_on_and_the_old_map_is_whole(sm
         assert on_disk(small_disk / "map") == before
         assert sorted(path.name for path in (small_disk / "map").iterdir()) == files
         go_on(database, 5, seed=2)
+    tally("1 saves on a full disk", 3, 3)
     (small_disk / "log").unlink()
     tools.prune(small_disk / "map", small_disk / "less", keep=10)  # there is room again
     database.clear()

@@ -26,6 +26,7 @@ from test.ros.camera import EPOCH_S, Camera, Health, image, reliable, scene
 from test.ros.controls import trigger
 from test.ros.malform import png_claiming
 from test.ros.processes import NODE, ROOT, Listener, Process, publisher, running_node, wait_until
+from test.tally import tally
 
 pytestmark = pytest.mark.process
 FULL = os.environ.get("PNV_ROS_FAULTS") == "full"
@@ -63,6 +64,7 @@ def test_malformed_messages_cost_neither_the_node_nor_a_good_frame(listener, cap
         with capsys.disabled():
             print(f"\nmalformed: offered {offered} + {good} good, dealt with {survived}, "
                   f"memory {memory:.0f} -> {node.memory_mb():.0f} MB, {node.threads()} threads")  # fmt: skip
+        tally("malformed messages", offered + good, survived, offered + good - survived)
         assert survived == offered + good
         assert int(values["frames processed"]) >= good
         assert int(values["dropped: unusable"]) > offered // 3
@@ -168,6 +170,17 @@ def test_a_full_disk_while_saving_is_told_and_frames_go_on(listener, tmp_path):
         assert node.end() == 0
 
 
+def test_a_node_whose_last_autosave_fails_ends_with_a_status_that_says_so(listener, tmp_path):
+    health = Health(listener)
+    with running_node(map_path=tmp_path / "map", autosave=True, autosave_interval_s=600.0, **EAGER) as node:
+        Camera(listener, health, "camera/image_raw").send(image(scene(1), at(1)))
+        resource.prlimit(node.child.pid, resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
+        assert node.end() == 1
+    assert "autosave: cannot save" in node.output
+    assert "Traceback" not in node.output
+    tally("1b autosaves that fail to the end and are said by the exit status", 1, 1)
+
+
 def test_a_subscriber_that_never_reads_does_not_hold_the_node_up(listener, tmp_path):
     count, wake = 300 if FULL else 40, threading.Event()
     sleeper = Listener()
@@ -214,6 +227,7 @@ def test_random_parameters_leave_the_node_valid(listener):
         assert all(r.reason and "\n" not in r.reason for r in refused)
         camera.send(image(scene(1), at(1)))
         assert health.count("frames processed") == 1
+        tally("6 parameters set to anything while running", len(results), len(results))
         assert node.end() == 0
 
 

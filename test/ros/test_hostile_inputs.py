@@ -15,6 +15,7 @@ from pnv_ros.parameters import DECLARED
 from test.ros.camera import Camera, Health, image, reliable, scene
 from test.ros.processes import NODE, Listener, Process, executable, running_node, wait_until
 from test.ros.test_faults import EAGER, at
+from test.tally import tally
 
 pytestmark = pytest.mark.process
 
@@ -50,6 +51,7 @@ def test_camera_infos_are_heard_checked_and_taken_anew_and_frames_without_one_ar
         node.wait_for("images of camera/image_raw are anew rectified as 320x240")
         camera.send(image(scene(3), at(3)))
         assert health.count("frames processed") == 1
+        tally("4 camera infos heard by the node", 3, 3)
         assert node.end() == 0
         assert "Traceback" not in node.output
 
@@ -79,6 +81,7 @@ def test_diagnostics_say_why_none_of_the_frames_that_come_is_used(listener):
         listener.call(SetBool, f"{NODE}/pause", SetBool.Request(data=True))
         rear.send(image(scene(1), at(30)))
         warned(health, "paused")
+        tally("5 cameras none of whose frames is used, said on /diagnostics", 4, 4)
         assert node.end() == 0
 
 
@@ -106,6 +109,7 @@ def test_a_node_starts_from_its_own_dump_with_the_same_parameters(listener, tmp_
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(first))
     with running_node("--params-file", str(tmp_path / "params.yaml")) as node:
         assert dumped(listener) == first
+        tally("6 parameters given back as they were dumped", len(DECLARED), len(DECLARED))
         assert node.end() == 0
         assert "no parameter" not in node.output
 
@@ -132,6 +136,7 @@ def test_a_parameter_file_that_cannot_be_used_is_one_line(tmp_path, kind):
     said = [line for line in done.stderr.splitlines() if line.startswith("place_recognizer: ")]
     assert len(said) == 1
     assert len(said[0]) <= 1100
+    tally("6 parameter files that cannot be used", 1, 1)
 
 
 def test_a_parameter_that_the_node_does_not_have_is_named(listener):

@@ -16,6 +16,7 @@ from pnv_ros.saved_map import SavedMap
 from pnv_ros.services import Services
 from test.maps.worlds import MODEL, contents, driven, go_on, on_disk
 from test.ros.processes import wait_until
+from test.tally import tally
 
 
 class SlowStore:
@@ -89,6 +90,7 @@ def test_a_path_that_was_left_and_taken_again_is_saved_to_and_loaded_from(tmp_pa
     saved_map.path = str(tmp_path / "a")
     saved_map.save()  # of the map loaded from b: that of a is kept
     assert on_disk(tmp_path / "a.before-1") == before
+    tally("1b saves to paths that were left and taken again", 7, 7)
 
 
 def test_frames_go_on_while_a_map_is_read(tmp_path):
