@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from pnv_cli import doctor
-from pnv_cli.bench import Measured, proposal
+from pnv_cli.bench import Measured, proposals
 from pnv_cli.main import main
 
 
@@ -50,7 +50,7 @@ def test_a_check_that_breaks_is_reported_not_raised(monkeypatch: pytest.MonkeyPa
 
 
 def measured(width: int, scorer: str, describe: float, candidate: float) -> Measured:
-    return Measured(width, width * 3 // 4, scorer, describe, 0.0, candidate, 100.0)
+    return Measured(width, width * 3 // 4, scorer, describe, candidate, 100.0)
 
 
 TABLE = [measured(320, "ransac", 100, 10), measured(320, "rapid", 100, 2), measured(160, "ransac", 30, 4)]
@@ -58,14 +58,14 @@ TABLE = [measured(320, "ransac", 100, 10), measured(320, "rapid", 100, 2), measu
 
 def test_the_proposal_fills_seventy_percent_of_the_time() -> None:
     # 1 Hz leaves 700 ms: 100 + 50 * 10 = 600 fits
-    assert proposal(TABLE, 1.0) == (TABLE[0], 50)
+    assert next(proposals(TABLE, 1.0)) == (TABLE[0], 50)
     # 2 Hz leaves 350 ms: 100 + 25 * 10 = 350 fits exactly
-    assert proposal(TABLE, 2.0) == (TABLE[0], 25)
+    assert next(proposals(TABLE, 2.0)) == (TABLE[0], 25)
     # 5 Hz leaves 140 ms: RANSAC needs 150 for five candidates, rapid 120 for ten
-    assert proposal(TABLE, 5.0) == (TABLE[1], 10)
+    assert next(proposals(TABLE, 5.0)) == (TABLE[1], 10)
     # 10 Hz leaves 70 ms: only the small image, 30 + 10 * 4
-    assert proposal(TABLE, 10.0) == (TABLE[2], 10)
-    assert proposal(TABLE, 100.0) is None
+    assert next(proposals(TABLE, 10.0)) == (TABLE[2], 10)
+    assert not list(proposals(TABLE, 100.0))
 
 
 def test_bench_prints_a_table_and_settings(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,5 +85,9 @@ def test_bench_prints_a_table_and_settings(capsys: pytest.CaptureFixture[str]) -
     report = json.loads(capsys.readouterr().out)
     assert {m["scorer"] for m in report["measured"]} == {"usac", "rapid"}
     assert report["proposal"]["candidates"] == 50
+    assert report["check"]["keeps_up"]
+    for m in report["measured"]:  # local features and thumbnails are in it
+        assert m["frame_ms"] > 0
+        assert m["keyframe_kb"] > 10
     assert main(["bench", "--rate", "0"]) == 2
     assert "--rate 0 is out of range" in capsys.readouterr().err
