@@ -1,7 +1,17 @@
-"""How the product's times grow: patches with image size, patch sizes, K and D; retrieval with keyframes; re-ranking."""
+"""How the product's times grow: patches with image size, patch sizes, K and D; retrieval with keyframes; re-ranking.
 
+    python -m benchmarks.growth [--keyframes 1000 10000 100000 1000000] [--plot FILE]
+
+One database of global vectors, those of a robot that drives a course in laps (benchmarks/database.py), that grows to
+each size under `index auto`: what a query and a new keyframe take there, and memory. Patches are left out: describing
+and re-ranking a fixed number of candidates do not depend on the keyframes, and what patches take is bounded by
+memory_budget_mb (`benchmarks/database.py footprint`).
+"""
+
+import argparse
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +19,7 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 
+from benchmarks.database import LAPS, SECOND, Course
 from pnv_core.config import Config
 from pnv_core.database import KeyframeDatabase
 from pnv_core.describe.model_files import ModelInfo, build_model
@@ -19,6 +30,8 @@ from pnv_core.types import PatchGrid, PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
 
 _ROUNDS = 3
+_QUERIES = 200
+_DIM = 512  # of the default model
 _CHANNELS = 512
 
 
@@ -120,3 +133,74 @@ def plotted(growth: dict[str, dict[str, list[float]]], path: Path) -> None:
         axis.grid(alpha=0.3)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
+
+
+def resident_mb() -> float:
+    """Of this process."""
+    return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) / 1e3
+
+
+def keyframe_growth(sizes: list[int]) -> list[dict[str, float]]:
+    """Per number of keyframes: milliseconds of a query and of a new keyframe, and megabytes."""
+    course = Course(max(sizes[-1] // LAPS, 1), _DIM)
+    database = KeyframeDatabase(_DIM, sizes[-1] * (_DIM * 8 + 4000) / 1e6)
+    queries = course.frames(np.random.default_rng(7).uniform(0, course.places, _QUERIES), lap=LAPS)
+    vectors = chain.from_iterable(course.vectors(sizes[-1] + 1))
+    before, rows = resident_mb(), []
+    print("| keyframes | query p50 | query p95 | new keyframe | database | resident |\n|---:|---:|---:|---:|---:|---:|")
+    for size in sizes:
+        count, begun = size - len(database), time.process_time()
+        for _ in range(count):
+            database.add(len(database) * SECOND, "front", PlaceDescriptor(next(vectors), ()))
+        adding = 1e3 * (time.process_time() - begun) / count
+        taken = []
+        for query in queries:
+            start = time.perf_counter()
+            database.nearest(query, 10, (size + 3600) * SECOND, 30 * SECOND)
+            taken.append(1e3 * (time.perf_counter() - start))
+        median, late = (float(np.percentile(taken, p)) for p in (50, 95))
+        used, resident = database.bytes_used / 1e6, resident_mb() - before
+        rows.append({"keyframes": size, "p50": median, "p95": late, "add": adding, "MB": used, "resident": resident})
+        print(
+            f"| {size:,} | {median:.2f} ms | {late:.2f} ms | {adding:.2f} ms | {used:.0f} MB | {resident:.0f} MB |",
+            flush=True,
+        )
+    return rows
+
+
+def plotted_keyframes(rows: list[dict[str, float]], path: Path) -> None:
+    """Latency and memory over the number of keyframes."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, (times, memory) = pyplot.subplots(1, 2, figsize=(9, 3.6))
+    sizes = [row["keyframes"] for row in rows]
+    for axis, lines, unit in (
+        (times, {"p50": "query, median", "p95": "query, 95th percentile", "add": "new keyframe"}, "ms"),
+        (memory, {"MB": "database", "resident": "resident"}, "MB"),
+    ):
+        for key, label in lines.items():
+            axis.loglog(sizes, [row[key] for row in rows], "o-", label=label)
+        axis.set_xlabel("keyframes")
+        axis.set_ylabel(unit)
+        axis.grid(alpha=0.3)
+        axis.legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--keyframes", type=int, nargs="+", default=[1000, 10_000, 100_000, 1_000_000])
+    parser.add_argument("--plot", type=Path, default=Path("out/performance_keyframes.png"))
+    args = parser.parse_args()
+    rows = keyframe_growth(sorted(args.keyframes))
+    args.plot.parent.mkdir(parents=True, exist_ok=True)
+    plotted_keyframes(rows, args.plot)
+    print(f"drawn to {args.plot}")
+
+
+if __name__ == "__main__":
+    main()
