@@ -18,7 +18,8 @@ Mask = NDArray[np.bool_]
 LEAST = 4  # a homography needs four points
 _MOST, _CONFIDENCE = 2000, 0.995  # OpenCV's defaults, which the authors' code takes
 _ATTEMPTS = 10000  # unusable samples in a row after which OpenCV gives up
-_FIRST, _BLOCK = 256, 6144  # samples looked at together: often the first few suffice
+_FIRST, _BLOCK = 256, 4096  # samples looked at together, twice as many each time: often the first few suffice
+_ROWS = 256  # models whose residuals fit the second-level cache
 _DRAWS = 1 << 15
 _MULTIPLIER, _LOW = 4164903690, 0xFFFFFFFF  # of OpenCV's multiply-with-carry generator
 _AT_INFINITY = np.float32(1e-7)  # squared; a point whose depth is rounding alone agrees with nothing
@@ -83,13 +84,15 @@ def _best_model(source: Floats, target: Floats, limit: np.float32) -> NDArray[np
     best, tried, needed, useless, model = LEAST - 1, 0, _MOST, 0, None
     for block in itertools.count():
         rows, _ = _samples(matches, block)
-        points, images = (side[:, rows] for side in sides)  # (2, n, 4)
+        points, images = (np.take(side, rows, axis=1) for side in sides)  # (2, 4, n)
         good = _usable(points, images)  # exact in float32 for patches: their centres are whole or half pixels
-        gaps = np.diff(good, prepend=-1 - useless, append=len(rows)) - 1  # unusable samples before each and after all
+        gaps = (
+            np.diff(good, prepend=-1 - useless, append=rows.shape[1]) - 1
+        )  # unusable samples before each and after all
         if (long := np.flatnonzero(gaps[:-1] >= _ATTEMPTS)).size:
             good = good[: long[0]]
         good = good[: _MOST - tried]
-        models = _four_point_homographies(points[:, good].astype(np.float64), images[:, good].astype(np.float64))
+        models = _four_point_homographies(*(np.take(side, good, axis=2).astype(float) for side in (points, images)))
         counts = _counts(models, terms)
         record = np.maximum.accumulate(np.append(best, counts))
         for number in np.flatnonzero(record[1:] > record[:-1]):
@@ -105,35 +108,29 @@ def _best_model(source: Floats, target: Floats, limit: np.float32) -> NDArray[np
 
 
 def _usable(points: Floats, images: Floats) -> NDArray[np.int64]:
-    """(2, n, 4) each -> the samples with no three points on a line with the last, and no triangle turned over."""
-    rows = np.arange(points.shape[1])
-    alike = None
-    for triple in _TRIPLES:  # all four turned over, or none
-        p, q = points[:, rows], images[:, rows]
-        turned = _turn(p, *triple) * _turn(q, *triple) < 0
-        if alike is None:
-            alike = turned
-        else:
-            kept = turned == alike
-            rows, alike = rows[kept], alike[kept]
+    """(2, 4, n) each -> the samples with no three points on a line with the last, and no triangle turned over."""
+    turned = [_turn(points, *triple) * _turn(images, *triple) < 0 for triple in _TRIPLES]
+    alike = (turned[0] == turned[1]) & (turned[0] == turned[2]) & (turned[0] == turned[3])  # all four, or none
+    rows = np.flatnonzero(alike)
+    points, images = (np.take(side, rows, axis=2) for side in (points, images))
     usable = np.ones(len(rows), bool)
-    for side in (points[:, rows], images[:, rows]):
-        offsets = side[:, :, :3] - side[:, :, 3:]
+    for side in (points, images):
+        offsets = side[:, :3] - side[:, 3:]
         size = np.abs(offsets).sum(0)
         for j, k in _PAIRS:
-            area = offsets[0, :, k] * offsets[1, :, j] - offsets[1, :, k] * offsets[0, :, j]
-            usable &= np.abs(area) > _EPSILON * (size[:, j] + size[:, k])
+            area = offsets[0, k] * offsets[1, j] - offsets[1, k] * offsets[0, j]
+            usable &= np.abs(area) > _EPSILON * (size[j] + size[k])
     return rows[usable]
 
 
 def _turn(points: Floats, a: int, b: int, c: int) -> Floats:
-    (ax, ay), (bx, by), (cx, cy) = points[:, :, a], points[:, :, b], points[:, :, c]
-    return (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
+    x, y = points
+    return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
 
 
 def _from_square(p: Floats) -> list[list[Floats]]:
-    """The homographies from the unit square to four points (2, n, 4) (Heckbert 1989); not finite if there is none."""
-    (x0, x1, x2, x3), (y0, y1, y2, y3) = p[0].T, p[1].T
+    """The homographies from the unit square to four points (2, 4, n) (Heckbert 1989); not finite if there is none."""
+    (x0, x1, x2, x3), (y0, y1, y2, y3) = p
     sx, sy = x0 - x1 + x2 - x3, y0 - y1 + y2 - y3
     dx1, dx2, dy1, dy2 = x1 - x2, x3 - x2, y1 - y2, y3 - y2
     area = dx1 * dy2 - dx2 * dy1
@@ -142,7 +139,7 @@ def _from_square(p: Floats) -> list[list[Floats]]:
 
 
 def _four_point_homographies(points: Floats, images: Floats) -> NDArray[np.float32]:
-    """(2, n, 4) each -> (n, 9), the ninth 1; not finite where there is none."""
+    """(2, 4, n) each -> (n, 9), the ninth 1; not finite where there is none."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         a, b = _from_square(points), _from_square(images)
 
@@ -169,12 +166,18 @@ def _residual_terms(source: Floats, target: Floats, tolerance: float) -> NDArray
 def _counts(models: NDArray[np.float32], terms: NDArray[np.float32]) -> NDArray[np.int64]:
     """Matches within the tolerance of each model (n, 9); 0 for one that is not finite."""
     finite = np.asarray(np.isfinite(models).all(axis=1))
-    residuals = np.where(finite[:, None], models, 0) @ terms
+    models = np.where(finite[:, None], models, 0)
+    counts = [_count(models[start : start + _ROWS], terms) for start in range(0, len(models), _ROWS)]
+    return np.where(finite, np.concatenate([np.empty(0, np.int64), *counts]), 0)
+
+
+def _count(models: NDArray[np.float32], terms: NDArray[np.float32]) -> NDArray[np.int64]:
+    residuals = models @ terms
     np.square(residuals, out=residuals)
     across, down, limit = np.split(residuals, 3, axis=1)
     across += down
     across += _AT_INFINITY
-    return np.where(finite, np.count_nonzero(across <= limit, axis=1), 0)
+    return np.asarray(np.count_nonzero(across <= limit, axis=1))
 
 
 def _iterations(outliers: float, most: int) -> int:
@@ -196,14 +199,14 @@ def _draws(power: int) -> NDArray[np.uint32]:
     return np.array(found, np.uint32)
 
 
-@functools.lru_cache(maxsize=256)  # 50 kB each; neighbouring frames have about as many matches
+@functools.lru_cache(maxsize=512)  # up to 33 kB each; neighbouring frames have about as many matches
 def _samples(matches: int, block: int) -> tuple[NDArray[np.int16], int]:
-    """(n, 4) numbers of matches as OpenCV draws them, four different ones at a time, and how many draws that took.
+    """(4, n) numbers of matches as OpenCV draws them, four different ones at a time, and how many draws that took.
 
-    Block 0 has _FIRST samples, every later one _BLOCK.
+    Block 0 has _FIRST samples, every later one twice as many up to _BLOCK.
     """
     start = _samples(matches, block - 1)[1] if block else 0
-    count = _BLOCK if block else _FIRST
+    count = min(_FIRST << min(block, 10), _BLOCK)
     enough = max(15, (start + 8 * count).bit_length())
     while True:
         drawn = (_draws(enough)[start:] % np.uint32(matches)).astype(np.int16)
@@ -213,7 +216,7 @@ def _samples(matches: int, block: int) -> tuple[NDArray[np.int16], int]:
             clean &= quads[:, j] != quads[:, k]
         rows, at = _walk(drawn, quads, clean.tobytes(), count)
         if len(rows) == count:
-            return rows, start + at
+            return np.ascontiguousarray(rows.T), start + at
         enough += 1
 
 
