@@ -11,7 +11,7 @@ from pnv_cli.common import writable
 from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
 
-_VARIANT = 1  # of EfficientNet-Lite
+_VARIANT = 0  # of EfficientNet-Lite
 _POOLED_SHARE = 0.75  # of the cosine; chosen on the development sets, see MODEL_CARD.md
 
 
@@ -91,7 +91,7 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
     options = _options(TrainOptions, args.set, **({"steps": 0} | given))
     size, view = _size(args.size), _size(args.view)
     trained, held = _split(args.data)
-    trunk = imagenet_trunk(args.imagenet, _VARIANT)
+    trunk = imagenet_trunk(args.imagenet, _VARIANT, deep=True)
     layers = min(options.frozen_layers, trunk.depth - 1)
     # the pool draws four views a place; a training batch takes some of them
     drawn = BatchOptions(
@@ -103,7 +103,7 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
     pool.build(trunk, layers, bar(range(pool.groups), desc="views", unit="group"))
     info = ModelInfo(
         "lite",
-        {"variant": _VARIANT, "neck": args.neck},
+        {"variant": _VARIANT, "neck": args.neck, "deep": True},
         *size,
         patch_sizes=(2,),  # as good as any set of sizes 1 to 3 on the development sets, for the least memory
         patch_weights=(1.0,),

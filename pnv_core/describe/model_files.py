@@ -50,8 +50,8 @@ class Model:
     """A describing network: what its file says and its tensors in float32, by name, as `build_model` checks them.
 
     Without the part `patch_projection` patches share the global one, as in the paper. With `pooled_projection` the
-    global vector is the projected VLAD beside the projected generalised mean of the map before the trunk's neck,
-    weighed by `pooled_share`: it keeps how strongly features respond, which VLAD's unit local descriptors do not.
+    global vector is the projected VLAD beside the projected generalised mean of the map that the trunk has for
+    it, weighed by `pooled_share`: it keeps how strongly features respond, which VLAD's unit local descriptors do not.
     Without it (every published model) the global vector is the projected VLAD.
     """
 
@@ -127,7 +127,7 @@ def build_model(info: ModelInfo, tensors: Mapping[str, NDArray], source: str) ->
             bias = model.tensors.get(f"{part}.bias")
             if bias is None or bias.ndim != 1:
                 raise ModelError(f"{source}: {part}.bias is missing or no vector; allowed: (D,)")
-            inputs = trunk.width if part == "pooled_projection" else centroids.size
+            inputs = trunk.pooled_width if part == "pooled_projection" else centroids.size
             expected[part] = {"bias": bias.shape, "weight": (len(bias), inputs)}
     for part, shapes in expected.items():
         _check_exactly(shapes, model.part(part), f"{source}: {part}")

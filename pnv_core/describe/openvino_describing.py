@@ -1,9 +1,9 @@
 """Describing with OpenVINO: pixels to descriptors in one graph.
 
-K clusters, C channels, W channels before the trunk's neck, h x w feature map (N = h * w cells), D dimensions,
-n = patches of one size. Window sums add one axis at a time and cancel nothing. A projection is linear and so is the sum
-over a window: each cluster's residual map is projected once, and its windows are summed afterwards; only the norms of
-the intra-normalisation need the unprojected sums.
+K clusters, C channels, h x w feature map (N = h * w cells), E channels of the h' x w' map that is pooled,
+D dimensions, n = patches of one size. Window sums add one axis at a time and cancel nothing. A projection is linear
+and so is the sum over a window: each cluster's residual map is projected once, and its windows are summed afterwards;
+only the norms of the intra-normalisation need the unprojected sums.
 """
 
 import hashlib
@@ -53,7 +53,7 @@ class OpenVinoDescribing:
         return self._compiled(partial(trunk_maps, self._model, self._size), "trunk", self._size)
 
     def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, Floats]:
-        """The trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+        """The trunk's maps: features (C, h, w), and what is pooled (E, h', w')."""
         if self._dense is not None:
             features = self._dense(pixels)
             return features, features
@@ -79,25 +79,26 @@ def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Mode
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
-    """As `describing`, from the trunk's maps: (1, C, h, w), (1, W, h, w) and (1, 1, h, w)."""
+    """As `describing`, from the trunk's maps: (1, C, h, w), (1, E, h', w') and (1, 1, h, w)."""
     features = ops.parameter([1, model.trunk.channels, *cells], np.float32)
-    wide = ops.parameter([1, model.trunk.width, *cells], np.float32)
+    wide = ops.parameter([1, *model.trunk.pooled_shape(cells)], np.float32)
     counted = ops.parameter([1, 1, *cells], np.float32)
     return ov.Model(_described(model, features, wide, counted, windows), [features, wide, counted], "head")
 
 
 def trunk_maps(model: Model, size: tuple[int, int]) -> ov.Model:
-    """(1, H, W, 3) uint8 -> the trunk's maps, and those before its neck where it has one."""
+    """(1, H, W, 3) uint8 -> the trunk's features, and what is pooled where that is another map."""
     pixels, features, wide = _maps(model, size)
-    return ov.Model([features, wide] if model.trunk.neck else [wide], [pixels], "trunk")
+    different = model.trunk.neck or model.trunk.deep
+    return ov.Model([features, wide] if different else [wide], [pixels], "trunk")
 
 
 def _maps(model: Model, size: tuple[int, int]) -> tuple[Node, Node, Node]:
-    """The graph's input, the trunk's maps, and those before its neck."""
+    """The graph's input, the trunk's features, and what is pooled."""
     trunk, weights = model.trunk, model.part("trunk")
     pixels, images = image_input(*size)
     wide = build(trunk.layers, weights, images)
-    return pixels, build(trunk.neck, weights, wide), wide
+    return pixels, build(trunk.neck, weights, wide), build(trunk.deep, weights, wide)
 
 
 def _described(model: Model, features: Node, wide: Node, counted: Node, windows: Windows) -> list[Node]:
@@ -130,6 +131,9 @@ def _global_vector(model: Model, x: Node, weights: Node, wide: Node, counted: No
     vlad = _unit(ops.reshape(_unit(sums, 1), integers(1, centroids.size), False), 1)
     vector = _projected(model, "global_projection", vlad)
     if model.has("pooled_projection"):
+        step = counted.shape[3] // wide.shape[3]
+        if step > 1:
+            counted = ops.avg_pool(counted, [step, step], [0, 0], [0, 0], [step, step], True)
         cubes = ops.power(ops.maximum(wide, constant(1e-6)), constant(3.0))
         total = ops.reduce_sum(ops.multiply(cubes, counted), integers(2, 3), False)  # (1, W)
         area = ops.maximum(ops.reduce_sum(counted, integers(2, 3), False), constant(1e-6))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
@@ -23,6 +24,7 @@ class TorchTrunk(TorchNetwork):
 
     def __init__(self, trunk: Trunk) -> None:
         super().__init__((*trunk.layers, *trunk.neck))
+        self.add(trunk.deep, trunk.width)
         self.trunk = trunk
         self.channels, self.width, self.stride = trunk.channels, trunk.width, trunk.stride
 
@@ -32,7 +34,7 @@ class TorchTrunk(TorchNetwork):
         return len(self.trunk.layers) - self.trunk.input_layers
 
     def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The feature map (B, C, h, w), and the one before the neck (B, W, h, w)."""
+        """The feature map (B, C, h, w), and the one that is pooled (B, E, h', w')."""
         if self.trunk.dense is not None:
             features = [self.trunk.dense(image) for image in images.permute(0, 2, 3, 1).cpu().numpy()]
             found = torch.from_numpy(np.stack(features)).to(images.device)
@@ -47,12 +49,12 @@ class TorchTrunk(TorchNetwork):
         return self.run(images, 0, self.trunk.input_layers + layers)
 
     def back(self, maps: Tensor, layers: int) -> tuple[Tensor, Tensor]:
-        """The rest after `front` with as many layers: features, and what is before the neck."""
+        """The rest after `front` with as many layers: features, and what is pooled."""
         wide = self.wide(maps, layers)
-        return self.run(wide, len(self.trunk.layers)), wide
+        return self.run(wide, len(self.trunk.layers)), self._run(self.trunk.deep, wide)
 
     def wide(self, maps: Tensor, layers: int) -> Tensor:
-        """As `back`, without the neck."""
+        """As `back`, before the neck: (B, W, h, w)."""
         return self.run(maps, self.trunk.input_layers + layers, len(self.trunk.layers))
 
     def front_parameters(self, layers: int) -> list[nn.Parameter]:
@@ -104,14 +106,16 @@ class TorchModel:
         return self.patch_projection or self.global_projection
 
     def global_vector(self, vlad: Tensor, wide: Tensor, cells: Tensor | None = None) -> Tensor:
-        """VLADs (B, K * C) and the maps before the trunk's neck (B, W, h, w) -> unit global vectors (B, D).
+        """VLADs (B, K * C) and the maps that are pooled (B, E, h', w') -> unit global vectors (B, D).
 
-        `cells` (B, N) say how much each cell counts.
+        `cells` (B, 1, h, w) say how much each cell counts.
         """
         vector: Tensor = self.global_projection(vlad)
         if self.pooled_projection is None:
             return vector
         share = self.info.pooled_share
+        if cells is not None:
+            cells = F.avg_pool2d(cells, cells.shape[-1] // wide.shape[-1]).flatten(1)
         pooled = self.pooled_projection(gem(wide, cells))
         return torch.cat([vector * math.sqrt(1 - share), pooled * math.sqrt(share)], dim=1)
 
@@ -133,7 +137,7 @@ class TorchDescribing:
         self._threads = threads
 
     def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+        """The trunk's maps: features (C, h, w), and what is pooled (E, h', w')."""
         with torch.inference_mode(), _threads(self._threads):
             features, wide = self._maps(pixels)
             return features[0].cpu().numpy(), wide[0].cpu().numpy()
@@ -153,8 +157,8 @@ class TorchDescribing:
             x, weights = self._model.netvlad.soft_assign(features)
             counted = None
             if cells is not None:
-                counted = torch.from_numpy(cells).to(weights).reshape(1, -1)
-                weights = weights * counted[:, None]
+                counted = torch.from_numpy(cells).to(weights).reshape(1, 1, *features.shape[-2:])
+                weights = weights * counted.flatten(2)
             vector = self._model.global_vector(self._model.netvlad.vlad(x, weights), wide, counted)[0]
             projection, centroids = self._model.patches_projection, self._model.netvlad.centroids
             patches = patch_descriptors(

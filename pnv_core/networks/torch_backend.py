@@ -30,6 +30,10 @@ class TorchNetwork(nn.Module):
     def __init__(self, network: Network, channels: int = 3) -> None:
         super().__init__()
         self.network = network
+        self.add(network, channels)
+
+    def add(self, network: Network, channels: int) -> None:
+        """Parameters for a network whose input has so many channels."""
         for conv, inputs in convolutions(network, channels):
             module = nn.Conv2d(inputs, conv.outputs, conv.kernel, conv.stride, groups=conv.groups, bias=conv.bias)
             *folders, last = conv.name.split(".")

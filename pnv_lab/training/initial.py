@@ -16,7 +16,6 @@ from pnv_core.describe.patches import patch_vlads
 from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.errors import ModelError
-from pnv_core.networks.layers import convolutions
 from pnv_lab.fit import FitOptions, learned_whitening, local_samples, pca, projection_of, vocabulary
 from pnv_lab.training.pool import FeaturePool
 
@@ -27,7 +26,7 @@ _PATCH_PLACES, _PATCHES_A_PLACE = 400, 50  # corresponding patches that the patc
 _PATCH_REACH = 0.5  # cells between corresponding patches, at most
 
 
-def imagenet_trunk(weights: Path | str, variant: int) -> TorchTrunk:
+def imagenet_trunk(weights: Path | str, variant: int, deep: bool = False) -> TorchTrunk:
     """A trunk without neck from an EfficientNet-Lite file (.pth; the names of efficientnet-lite-pytorch), norms folded.
 
     Raises ModelError for a file that holds anything else.
@@ -36,29 +35,29 @@ def imagenet_trunk(weights: Path | str, variant: int) -> TorchTrunk:
         tensors = torch.load(weights, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         raise ModelError(f"{weights}: not a readable tensor file ({error})") from None
-    plan = lite_trunk(variant, neck=0)
+    plan = lite_trunk(variant, neck=0, deep=deep)
     trunk = TorchTrunk(plan)
     try:
-        names = [conv.name for conv, _ in convolutions(plan.layers, 3)]
         state: dict[str, Tensor] = {}
-        for name in names:
-            state[f"{name}.weight"], state[f"{name}.bias"] = _folded(tensors, *_published(name, names))
+        for name in (n.removesuffix(".bias") for n in plan.tensor_shapes() if n.endswith(".bias")):
+            state[f"{name}.weight"], state[f"{name}.bias"] = _folded(tensors, *_published(name, len(plan.layers) - 4))
         trunk.load_state_dict(state)
     except (KeyError, TypeError, RuntimeError) as error:
         raise ModelError(f"{weights}: no EfficientNet-Lite{variant} ({error})") from None
     return trunk.eval()
 
 
-def _published(name: str, names: list[str]) -> tuple[str, str]:
-    """What the published file calls a convolution of ours and the batch norm after it."""
+def _published(name: str, block: int) -> tuple[str, str]:
+    """What the published file calls a convolution of ours and the batch norm after it; `block` holds `expand`."""
     if name == "stem":
         return "_conv_stem", "_bn0"
     if name == "expand":  # of the block after our last one
-        blocks = 1 + max(int(n.split(".")[1]) for n in names if n.startswith("blocks."))
-        return f"_blocks.{blocks}._expand_conv", f"_blocks.{blocks}._bn0"
-    _, block, part = name.split(".")
+        return f"_blocks.{block}._expand_conv", f"_blocks.{block}._bn0"
+    if name == "head":
+        return "_conv_head", "_bn1"
+    _, number, part = name.split(".")
     norm = {"expand": "_bn0", "depthwise": "_bn1", "project": "_bn2"}[part]
-    return f"_blocks.{block}._{part}_conv", f"_blocks.{block}.{norm}"
+    return f"_blocks.{number}._{part}_conv", f"_blocks.{number}.{norm}"
 
 
 def _folded(tensors: dict[str, Tensor], conv: str, norm: str) -> tuple[Tensor, Tensor]:

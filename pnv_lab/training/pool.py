@@ -18,6 +18,7 @@ from torch import Tensor
 
 from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.files import atomic_write
+from pnv_core.networks.layers import convolutions
 from pnv_core.networks.openvino_backend import Compiled, build, image_input
 from pnv_lab.training.batches import Batch, Origin, PlaceBatches, assembled
 
@@ -69,8 +70,10 @@ class FeaturePool:
         for image in self.batches.images:
             digest.update(repr(replace(image, rgb=image.rgb.shape)).encode())  # type: ignore[arg-type]
             digest.update(image.rgb.tobytes())
-        for name, tensor in trunk.state_dict().items():
-            digest.update(name.encode() + tensor.float().cpu().contiguous().numpy().tobytes())
+        state = trunk.state_dict()
+        for conv, _ in convolutions(trunk.trunk.layers[: trunk.trunk.input_layers + layers], 0):
+            for part in ("weight", "bias"):
+                digest.update(state[f"{conv.name}.{part}"].float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()[:24]
 
     def _open(self, place: Path) -> None:

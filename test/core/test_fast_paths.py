@@ -18,7 +18,7 @@ from pnv_core.describe.describer import resized
 from pnv_core.describe.model_files import ModelInfo, build_model
 from pnv_core.describe.openvino_describing import head
 from pnv_core.describe.patches import patch_descriptors
-from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.errors import ConfigError
 from pnv_core.networks.openvino_backend import Compiled, fast_precisions
 from pnv_core.recognizer import PlaceRecognizer
@@ -47,11 +47,11 @@ def local_descriptors(seed, clusters, channels, dim, shape, sharpness):
 def aggregated(features, tensors, windows, counted=None):
     """The patches of the OpenVINO graph."""
     channels = features.shape[0]
-    trunk = {"neck.weight": np.zeros((channels, 384, 1, 1)), "neck.bias": np.zeros(channels)}
+    trunk = {"neck.weight": np.zeros((channels, 672, 1, 1)), "neck.bias": np.zeros(channels)}
     arrays = {name: tensor.numpy() for name, tensor in tensors.items()} | {f"trunk.{n}": t for n, t in trunk.items()}
-    shapes = compact_trunk(neck=channels).tensor_shapes()
+    shapes = lite_trunk(neck=channels).tensor_shapes()
     arrays |= {f"trunk.{name}": np.zeros(shape) for name, shape in shapes.items() if f"trunk.{name}" not in arrays}
-    model = build_model(ModelInfo("compact", {"neck": channels}), arrays, "test")
+    model = build_model(ModelInfo("lite", {"neck": channels}), arrays, "test")
     cells = features.shape[1:]
     counted = np.ones((1, 1, *cells), np.float32) if counted is None else counted
     wide = np.zeros((1, model.trunk.width, *cells), np.float32)

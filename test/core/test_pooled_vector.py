@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
+from pnv_core.config import Config
 from pnv_core.describe.describer import Describer
 from pnv_core.describe.model_files import Model, ModelInfo, load_model, save_model
 from pnv_core.describe.netvlad import NetVLAD, Projection, gem
 from pnv_core.describe.torch_model import TorchModel, TorchTrunk
-from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.errors import ModelError
 
 WIDTH, HEIGHT = 96, 80
@@ -20,14 +21,15 @@ def counted_mean(maps: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return root / np.linalg.norm(root)
 
 
-def pooled_model() -> Model:
+def pooled_model(deep: bool = True) -> Model:
     torch.manual_seed(4)
-    trunk = TorchTrunk(compact_trunk(fires=6, neck=8))
-    parts = [NetVLAD(3, 8), Projection(24, 6), Projection(24, 5), Projection(trunk.width, 4)]
+    options = {"variant": 0, "neck": 8, "deep": deep}
+    trunk = TorchTrunk(lite_trunk(**options))
+    parts = [NetVLAD(3, 8), Projection(24, 6), Projection(24, 5), Projection(trunk.trunk.pooled_width, 4)]
     for part in parts:
         for parameter in part.parameters():
             torch.nn.init.normal_(parameter)
-    info = ModelInfo("compact", {"fires": 6, "neck": 8, "relu": True}, WIDTH, HEIGHT, (2,), (1.0,))
+    info = ModelInfo("lite", options, WIDTH, HEIGHT, (2,), (1.0,))
     return TorchModel(info, trunk, *parts).model()
 
 
@@ -44,8 +46,9 @@ def test_generalised_mean_counts_cells_by_their_weight(masked):
     assert np.allclose(found[0].numpy(), counted_mean(maps[0], weights), atol=1e-6)
 
 
-def test_the_global_vector_is_the_projected_vlad_beside_the_projected_mean():
-    model = pooled_model()
+@pytest.mark.parametrize("deep", [False, True])
+def test_the_global_vector_is_the_projected_vlad_beside_the_projected_mean(deep):
+    model = pooled_model(deep)
     describer = Describer(model)
     vector = describer.describe(image(0)).global_vector.astype(np.float64)
     features, wide = describer.maps(image(0))
@@ -63,7 +66,7 @@ def test_the_global_vector_is_the_projected_vlad_beside_the_projected_mean():
 
 def test_a_mask_hides_cells_from_the_pooled_half_too():
     """What changes well under the mask moves the vector by a tenth of what it does without one, or less."""
-    describer = Describer(pooled_model())
+    describer = Describer(pooled_model(deep=False))
     first, second = image(1), image(1)
     second[64:] = 0
     valid = np.ones((HEIGHT, WIDTH), bool)
@@ -85,3 +88,13 @@ def test_a_model_file_keeps_the_pooled_part(tmp_path):
     wrong = Model(model.info, model.tensors | {"pooled_projection.weight": np.zeros((4, 24), np.float32)})
     with pytest.raises(ModelError, match="pooled_projection"):
         save_model(wrong, tmp_path / "wrong.safetensors")
+
+
+def test_both_backends_count_the_cells_of_a_deep_map_alike():
+    """At 15 x 21 cells a mask's last row and column have no partner in the map of half the size."""
+    model, mask = pooled_model().with_info(image_width=336, image_height=240), np.ones((240, 336), bool)
+    mask[:100, 200:] = False
+    rgb = np.random.default_rng(5).integers(0, 256, (240, 336, 3), np.uint8)
+    configs = (Config.make(weights="x", backend=backend) for backend in ("openvino", "torch"))
+    vectors = [Describer(model, config).describe(rgb, mask).global_vector for config in configs]
+    assert np.allclose(*vectors, atol=1e-3)

@@ -13,7 +13,6 @@ TRUNKS: "Registry[Trunk]" = Registry(
     {
         "vgg16": "pnv_core.describe.trunks.vgg16:vgg16_trunk",
         "lite": "pnv_core.describe.trunks.lite:lite_trunk",
-        "compact": "pnv_core.describe.trunks.compact:compact_trunk",
         "rootsift": "pnv_core.describe.trunks.rootsift:rootsift_trunk",
     },
     ModelError,

@@ -8,7 +8,6 @@ import pytest
 import torch
 
 from pnv_core.describe.trunks.lite import lite_trunk
-from pnv_core.networks.layers import convolutions
 
 
 @pytest.fixture(scope="session")
@@ -32,15 +31,18 @@ def imagenet_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Weights with the names of the ImageNet file, values at random, batch norms included."""
     torch.manual_seed(3)
     path = tmp_path_factory.mktemp("weights") / "trunk.pth"
-    convs = {c.name: (c.outputs, n // c.groups, c.kernel) for c, n in convolutions(lite_trunk(1, neck=0).layers, 3)}
-    blocks = sum(name.endswith("depthwise") for name in convs)
+    layers = lite_trunk(1, neck=0, deep=True)
+    convs = {n.removesuffix(".weight"): s for n, s in layers.tensor_shapes().items() if n.endswith(".weight")}
     norms = {"expand": "_bn0", "depthwise": "_bn1", "project": "_bn2"}
+    published = {"stem": ("_conv_stem", "_bn0"), "head": ("_conv_head", "_bn1")}
+    published["expand"] = ("_blocks.15._expand_conv", "_blocks.15._bn0")
     tensors: dict[str, torch.Tensor] = {}
-    for name, (outputs, inputs, kernel) in convs.items():
-        _, block, part = name.split(".") if "." in name else ("", str(blocks), name)
-        conv, norm = f"_blocks.{block}._{part}_conv", f"_blocks.{block}.{norms.get(part)}"
-        if name == "stem":
-            conv, norm = "_conv_stem", "_bn0"
+    for name, (outputs, inputs, kernel, _) in convs.items():
+        if name in published:
+            conv, norm = published[name]
+        else:
+            _, block, part = name.split(".")
+            conv, norm = f"_blocks.{block}._{part}_conv", f"_blocks.{block}.{norms[part]}"
         tensors[f"{conv}.weight"] = torch.randn(outputs, inputs, kernel, kernel) / (inputs * kernel**2) ** 0.5
         tensors |= {f"{norm}.{n}": torch.rand(outputs) + 0.5 for n in ("weight", "running_var")}
         tensors |= {f"{norm}.{n}": torch.randn(outputs) * 0.1 for n in ("bias", "running_mean")}

@@ -43,16 +43,16 @@ def killed_after(steps):
 def pool(picture_folder, imagenet_file, tmp_path):
     drawn = PlaceBatches(load_set(picture_folder), BatchOptions(places=4, views=3, neighbours=2, sizes=(VIEW,)))
     made = FeaturePool(tmp_path / "pool", drawn, groups=3, places=4, views=2)
-    made.build(imagenet_trunk(imagenet_file, 1), 16)
+    made.build(imagenet_trunk(imagenet_file, 1, deep=True), 16)
     return made
 
 
 def trainer(pool, imagenet_file, folder, **changes):
-    info = ModelInfo("lite", {"variant": 1, "neck": 12}, *VIEW, (2,), (1.0,))
+    info = ModelInfo("lite", {"variant": 1, "neck": 12, "deep": True}, *VIEW, (2,), (1.0,))
     fit = FitOptions(
         clusters=3, global_dim=6, pooled_dim=3, patch_dim=5, image_width=96, image_height=80, patch_sizes=(2,)
     )
-    model = initial_model(imagenet_trunk(imagenet_file, 1), 12, pool, 16, info, fit)
+    model = initial_model(imagenet_trunk(imagenet_file, 1, deep=True), 12, pool, 16, info, fit)
     options = TrainOptions(
         steps=6,
         warmup=2,
@@ -99,7 +99,7 @@ def test_frozen_layers_keep_their_weights(pool, imagenet_file, tmp_path):
 
 
 def test_a_pool_gives_what_the_frozen_layers_give(pool, imagenet_file, picture_folder):
-    trunk = imagenet_trunk(imagenet_file, 1)
+    trunk = imagenet_trunk(imagenet_file, 1, deep=True)
     origins, views = pool.batches.render(1)
     image = torch.from_numpy(views[4].pixels).permute(2, 0, 1)[None].float() / 255
     with torch.no_grad():
@@ -204,7 +204,7 @@ def test_triplet_training_resumes_at_the_last_cache(picture_folder, tmp_path):
 
 def test_a_pool_of_other_images_seed_layers_or_size_is_not_taken_for_this_one(pool, imagenet_file, picture_folder):
     """Whatever lies in the folder, a pool's maps are those of its own views."""
-    trunk = imagenet_trunk(imagenet_file, 1)
+    trunk = imagenet_trunk(imagenet_file, 1, deep=True)
     images, options = pool.batches.images, pool.batches.options
     changes = {
         "images": (PlaceBatches(images[1:], options), 3, 16),
@@ -243,7 +243,7 @@ def test_an_imagenet_file_is_read_with_its_batch_norms_folded(imagenet_file):
     x = normed(torch.conv2d(x, tensors["_conv_stem.weight"], stride=2), "_bn0").clamp(0, 6)
     x = normed(torch.conv2d(x, tensors["_blocks.0._depthwise_conv.weight"], padding=1, groups=32), "_blocks.0._bn1")
     expected = normed(torch.conv2d(x.clamp(0, 6), tensors["_blocks.0._project_conv.weight"]), "_blocks.0._bn2")
-    found = imagenet_trunk(imagenet_file, 1).double().front(image, 2)
+    found = imagenet_trunk(imagenet_file, 1, deep=True).double().front(image, 2)
     assert torch.allclose(found, expected, atol=1e-6)
 
 

@@ -3,7 +3,6 @@ import pytest
 import torch
 
 from pnv_core.describe.torch_model import TorchTrunk
-from pnv_core.describe.trunks.compact import compact_trunk
 from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.describe.trunks.rootsift import rootsift_trunk
 
@@ -12,17 +11,11 @@ def lite(variant, **options):
     return TorchTrunk(lite_trunk(variant, **options))
 
 
-def compact(**options):
-    return TorchTrunk(compact_trunk(**options))
-
-
 def rootsift():
     return TorchTrunk(rootsift_trunk())
 
 
-@pytest.mark.parametrize(
-    "trunk", [compact(), compact(fires=5, neck=0, relu=False), lite(1), lite(0, neck=0), rootsift()]
-)
+@pytest.mark.parametrize("trunk", [lite(1), lite(0, neck=0), lite(0, deep=True), rootsift()])
 @pytest.mark.parametrize("size", [(480, 640), (240, 320), (100, 131)])
 def test_a_map_has_one_cell_per_sixteen_pixels(trunk, size):
     with torch.inference_mode():
@@ -30,9 +23,7 @@ def test_a_map_has_one_cell_per_sixteen_pixels(trunk, size):
     assert features.shape == (1, trunk.channels, size[0] // 16, size[1] // 16)
 
 
-@pytest.mark.parametrize(
-    "trunk", [compact(fires=6, neck=0), compact(fires=8, neck=0), lite(0, neck=0), lite(1, neck=0)]
-)
+@pytest.mark.parametrize("trunk", [lite(0, neck=0), lite(1, neck=0)])
 def test_a_cell_looks_at_pixels_around_its_centre(trunk):
     """VGG16's cell i is centred at pixel 16 i + 7: keypoints of both trunks mean the same."""
     torch.manual_seed(0)
@@ -45,13 +36,14 @@ def test_a_cell_looks_at_pixels_around_its_centre(trunk):
 
 
 def test_front_and_back_make_the_whole_trunk():
-    trunk = compact().eval()
+    trunk = lite(0, deep=True).eval()
     images = torch.rand(2, 3, 96, 112)
     with torch.inference_mode():
-        features, wide = trunk.back(trunk.front(images, 9), 9)
+        maps = trunk.front(images, 9)
+        features, pooled = trunk.back(maps, 9)
         assert torch.equal(features, trunk(images))
-        assert torch.equal(trunk.run(wide, len(trunk.trunk.layers)), features)
-        assert wide.shape[1] == trunk.width
+        assert torch.equal(trunk.run(trunk.wide(maps, 9), len(trunk.trunk.layers)), features)
+        assert pooled.shape[1:] == trunk.trunk.pooled_shape(features.shape[2:]) == (1280, 3, 3)
 
 
 def test_rootsift_ignores_brightness_and_contrast():
