@@ -44,6 +44,14 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--global-dim", type=int, default=512)
     parser.add_argument("--pooled-dim", type=int, default=384, help="of --global-dim, for the pooled features")
     parser.add_argument("--patch-dim", type=int, default=128)
+    parser.add_argument(
+        "--pooled-share", type=float, default=_POOLED_SHARE,
+        help=f"of the cosine, for the pooled features (default {_POOLED_SHARE:g}); 1: GeM alone",
+    )  # fmt: skip
+    parser.add_argument(
+        "--loss", choices=("ms", "ap"), default="ms",
+        help="of a training with steps: multi-similarity, or listwise average precision (AP-GeM, with --pooled-share 1)",
+    )  # fmt: skip
     parser.add_argument("--size", default="384x288", help="input size of the lite model (default 384x288)")
     parser.add_argument("--view", default="384x288", help="size of the views it is trained on (default 384x288)")
     parser.add_argument("--places", type=int, default=40, help="places a batch (default 40)")
@@ -87,8 +95,10 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
 
     if not 1 <= args.pooled_dim < args.global_dim:
         raise ConfigError(f"--pooled-dim {args.pooled_dim}; allowed: 1 to {args.global_dim - 1}, below --global-dim")
+    if not 0 <= args.pooled_share <= 1:
+        raise ConfigError(f"--pooled-share {args.pooled_share:g} is out of range; allowed: 0 to 1")
     given = {"seed": args.seed} if args.seed is not None else {}
-    options = _options(TrainOptions, args.set, **({"steps": 0} | given))
+    options = _options(TrainOptions, args.set, **({"steps": 0, "loss": args.loss} | given))
     size, view = _size(args.size), _size(args.view)
     trained, held = _split(args.data)
     trunk = imagenet_trunk(args.imagenet, _VARIANT, deep=True)
@@ -107,7 +117,7 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
         *size,
         patch_sizes=(2,),  # as good as any set of sizes 1 to 3 on the development sets, for the least memory
         patch_weights=(1.0,),
-        pooled_share=_POOLED_SHARE,
+        pooled_share=args.pooled_share,
         provenance=f"pnv train, seed {options.seed}, {options.steps} steps on {len(trained)} images; see MODEL_CARD.md",
     )
     fit = FitOptions(

@@ -32,6 +32,23 @@ def multi_similarity(
     return loss[anchors].mean() if anchors.any() else similarity.sum() * 0.0
 
 
+def listwise_ap(descriptors: Tensor, positive: Tensor, negative: Tensor, bins: int = 20) -> Tensor:
+    """1 - the mean average precision of every row's ranking of the others, made smooth by soft binning of the
+    similarities (Revaud et al., ICCV 2019, equations 4 to 8).
+
+    A pair that is neither positive nor negative is not ranked. 0 where no row has a positive.
+    """
+    similarity = descriptors @ descriptors.T
+    centres = torch.linspace(1, -1, bins, dtype=similarity.dtype, device=similarity.device)
+    shares = F.relu(1 - (similarity[None] - centres[:, None, None]).abs() * (bins - 1) / 2)  # (bins, B, B)
+    right, ranked = ((shares * pairs).sum(2) for pairs in (positive, positive | negative))  # (bins, B)
+    precision = right.cumsum(0) / ranked.cumsum(0).clamp(min=1e-8)
+    counts = positive.sum(1)
+    average = (precision * right).sum(0) / counts.clamp(min=1)
+    rows = counts > 0
+    return 1 - average[rows].mean() if rows.any() else similarity.sum() * 0.0
+
+
 def triplet_ranking(query: Tensor, positives: Tensor, negatives: Tensor, margin: float = TRIPLET_MARGIN) -> Tensor:
     """Weakly supervised triplet ranking loss (NetVLAD equation 7) of one query.
 

@@ -22,8 +22,10 @@ from pnv_core.describe.torch_model import TorchModel
 from pnv_core.errors import ModelError
 from pnv_lab.training.batches import Batch, Batches
 from pnv_lab.training.journal import Journal
-from pnv_lab.training.losses import multi_similarity, patch_contrast
+from pnv_lab.training.losses import listwise_ap, multi_similarity, patch_contrast
 from pnv_lab.training.validation import ValidationSet, describe_all, recalls
+
+LOSSES = {"ms": multi_similarity, "ap": listwise_ap}
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,7 @@ class TrainOptions:
     """Settings of a training. Learning rates are peaks of a cosine schedule with a linear start."""
 
     steps: int = 700
+    loss: str = "ms"  # of the global vectors: ms (multi-similarity) or ap (listwise average precision)
     trunk_lr: float = 1.5e-4
     neck_lr: float = 3e-4
     vlad_lr: float = 1e-3
@@ -154,7 +157,7 @@ class Trainer:
         features, wide = self._maps(batch.inputs.to(self.device))
         x, weights = self.model.netvlad.soft_assign(features)
         vectors = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide)
-        whole = multi_similarity(vectors, batch.positive.to(self.device), batch.negative.to(self.device))
+        whole = LOSSES[self.options.loss](vectors, batch.positive.to(self.device), batch.negative.to(self.device))
         parts = self._patch_loss(batch, x, weights, (features.shape[-2], features.shape[-1]))
         loss = whole + self.options.patch_weight * parts
         if self.options.anchor:

@@ -5,7 +5,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from pnv_lab.training.losses import multi_similarity, patch_contrast, triplet_ranking
+from pnv_lab.training.losses import listwise_ap, multi_similarity, patch_contrast, triplet_ranking
 
 
 def test_multi_similarity_equals_its_definition_pair_by_pair():
@@ -53,3 +53,22 @@ def test_patch_contrast_without_overlap_is_zero_and_has_a_gradient():
     loss = patch_contrast(patches, patches, torch.zeros(6, 3), torch.full((6, 3), 1e4), radius=1.5)
     loss.backward()
     assert loss.item() == 0.0
+
+
+def test_listwise_ap_is_average_precision_where_bins_tell_every_pair_apart():
+    """Oracle: average precision over sorted similarities; fine bins make the smooth one equal to it."""
+    rng = np.random.default_rng(4)
+    x = rng.normal(size=(9, 5))
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    positive = np.zeros((9, 9), bool)
+    positive[[0, 1, 0, 2, 3, 4], [1, 0, 2, 0, 4, 3]] = True
+    negative = ~positive & ~np.eye(9, dtype=bool)
+    negative[0, 5] = False  # not known: not ranked
+    precisions = []
+    for row in np.flatnonzero(positive.any(1)):
+        order = [j for j in np.argsort(-(x @ x[row])) if positive[row, j] or negative[row, j]]
+        hits = positive[row, order]
+        precisions.append(np.mean([hits[: n + 1].mean() for n in np.flatnonzero(hits)]))
+    known = (torch.from_numpy(m) for m in (positive, negative))
+    found = float(listwise_ap(torch.from_numpy(x), *known, bins=20001))
+    assert abs(found - (1 - np.mean(precisions))) < 1e-3
