@@ -50,7 +50,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     )  # fmt: skip
     parser.add_argument(
         "--loss", choices=("ms", "ap"), default="ms",
-        help="of a training with steps: multi-similarity, or listwise average precision (AP-GeM, with --pooled-share 1)",
+        help="of a training with steps: multi-similarity, or listwise average precision (--pooled-share 1: AP-GeM)",
     )  # fmt: skip
     parser.add_argument("--size", default="384x288", help="input size of the lite model (default 384x288)")
     parser.add_argument("--view", default="384x288", help="size of the views it is trained on (default 384x288)")
