@@ -163,7 +163,7 @@ def baselines(args: argparse.Namespace) -> list[tuple[TorchTrunk, dict[str, Head
     sample = sorted(random.Random(args.seed).sample(sample, min(200, len(sample))))
     found: list[tuple[TorchTrunk, dict[str, Head]]] = []
     if args.imagenet and "untrained" in args.methods.split(","):
-        trunk = imagenet_trunk(args.imagenet, 1)
+        trunk = imagenet_trunk(args.imagenet, 0)
         found.append((trunk, {"untrained, GeM": gem, "untrained, NetVLAD k-means": fitted(trunk, sample)}))
     if "rootsift" in args.methods.split(","):
         sift = TorchTrunk(rootsift_trunk())
@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument("part", choices=("dev", "report"))
     parser.add_argument("--data", type=Path, required=True)
     parser.add_argument("--train", type=Path, required=True)
-    parser.add_argument("--imagenet", type=Path, help="EfficientNet-Lite1 weights for the untrained baselines")
+    parser.add_argument("--imagenet", type=Path, help="EfficientNet-Lite0 weights for the untrained baselines")
     parser.add_argument("--weights", default="default")
     parser.add_argument("--methods", default="untrained,rootsift,default")
     parser.add_argument("--queries", type=int, default=100)

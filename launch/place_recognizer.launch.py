@@ -12,7 +12,7 @@ from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS = {
     "image_topics": ("['camera/image_raw']", "image topics, one per camera"),
-    "preset": ("default", "default, performance, speed or storage: the file of config/ that is taken"),
+    "preset": ("default", "default, performance, balanced, speed or storage: the file of config/ that is taken"),
     "map_path": ("", "folder of ~/save and ~/load"),
     "use_sim_time": ("false", "follow /clock"),
 }

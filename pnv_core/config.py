@@ -8,8 +8,8 @@ from pnv_core.errors import ConfigError
 from pnv_core.settings import Section, checked, setting, settings_of
 
 # What a preset sets when the user does not: patch geometry, scorer, input size and the file taken when none is named.
-# performance, speed and storage are the published configurations (Patch-NetVLAD repository, configs/*.ini); balanced is
-# the one between them in the paper's figure of time against recall: several sizes and RANSAC at a smaller D.
+# performance, speed and storage are the published configurations (Patch-NetVLAD repository, configs/*.ini); balanced
+# lies between them: several sizes and RANSAC at a smaller D. The paper draws a single size there, its D is not printed.
 _PUBLISHED: dict[str, Any] = {
     "image_width": 640,
     "image_height": 480,

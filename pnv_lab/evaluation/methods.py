@@ -17,6 +17,7 @@ from pnv_lab.evaluation.multiscale import cross_size_score, early_fusion_score
 
 PairScore = Callable[[Record, Record], float]
 SINGLE_SIZE = 5  # the paper's, section 4.1
+PUBLISHED_PRESETS = tuple(name for name in PRESETS if name != "default")
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Method:
 
     sizes: "single" (the paper's 5, or the middle one of the model's), "multi" (the model's), or explicit ones.
     fusion: "model" (its weights where it names these sizes, else equal), "equal", or explicit weights.
-    scorer: "" (retrieval only), ransac, rapid, early, cross, sift, or a LightGlue kind.
+    scorer: "" (retrieval only), configured, ransac, rapid, early, cross, sift, or a LightGlue kind.
+    preset: of the recogniser, in place of the settings given.
     """
 
     name: str
@@ -37,9 +39,12 @@ class Method:
     fusion: str | tuple[float, ...] = "model"
     dim: int | None = None
     weights: str | None = None
+    preset: str = ""
 
     def config(self, base: Config) -> Config:
         """The Config its features are extracted with."""
+        if self.preset:
+            base = base.replace(preset=self.preset, **PRESETS[self.preset])
         return base if self.weights is None else base.replace(weights=self.weights)
 
     def wanted_sizes(self, completed: Config) -> tuple[int, ...]:
@@ -117,13 +122,15 @@ METHODS: dict[str, Method] = {
         Method("equal-weights", "Equal fusion weights", scorer="ransac", fusion="equal"),
         Method("sift", "SIFT, ratio test, RANSAC", features="sift", scorer="sift"),
         *(Method(kind, label, features=kind, scorer=kind) for kind, label in LIGHTGLUE_KINDS.items()),
+        *(Method(name, f"Preset {name}", scorer="configured", preset=name) for name in PUBLISHED_PRESETS),
     )
 }
 GROUPS = {
     "paper": ("densevlad", "gem", "netvlad", "sift", "multi-ransac"),
     "variants": ("netvlad", "single-rapid", "single-ransac", "multi-rapid", "multi-ransac"),
     "ablations": ("multi-ransac", "equal-weights", "early-fusion", "cross-size", "patch-average", "patch-max"),
-    "all": tuple(name for name in METHODS if name not in LIGHTGLUE_KINDS and name != "patchnetvlad"),
+    "presets": ("patchnetvlad", *PUBLISHED_PRESETS, "lightglue-aliked"),
+    "all": tuple(name for name in METHODS if name not in (*LIGHTGLUE_KINDS, *PUBLISHED_PRESETS, "patchnetvlad")),
 }
 
 

@@ -197,7 +197,7 @@ def test_help_is_short_and_help_all_has_every_setting(capsys):
         assert stop.value.code == 0
         page = capsys.readouterr().out
         assert "--accept-score" in page
-        assert "{default,performance,speed,storage}" in page
+        assert "{default,performance,balanced,speed,storage}" in page
         assert ("--odometry-drift" in page) is shown
     with pytest.raises(SystemExit):
         main(["describe", "--help-all"])

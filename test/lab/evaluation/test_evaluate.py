@@ -18,6 +18,7 @@ from pnv_core.describe.model_files import Model
 from pnv_core.errors import ConfigError
 from pnv_core.settings import settings_of
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.reranker import Reranker
 from pnv_lab.evaluation.datasets import open_dataset
 from pnv_lab.evaluation.datasets.dataset import Dataset
 from pnv_lab.evaluation.datasets.pairs import pairs_dataset
@@ -324,3 +325,14 @@ def test_an_unwritable_home_is_no_obstacle(monkeypatch: pytest.MonkeyPatch) -> N
     assert folder.is_dir()
     assert folder.name.startswith("pnv_descriptors_")
     folder.rmdir()
+
+
+def test_a_preset_as_a_method_is_scored_as_the_recogniser_would():
+    base = Config.make(threads=1, trunk_precision="bfloat16")
+    for method in parse_methods("presets"):
+        if method.preset:
+            expected = Config.make(method.preset, threads=1, trunk_precision="bfloat16")
+            assert method.config(base) == expected
+            found, own = method.reranker(expected), Reranker(expected)
+            assert (found.search, found.weights, found.scale_weight) == (own.search, own.weights, own.scale_weight)
+    assert {m.preset for m in parse_methods("presets")} >= {"performance", "balanced", "speed", "storage"}

@@ -56,7 +56,7 @@ def test_patch_contrast_without_overlap_is_zero_and_has_a_gradient():
 
 
 def test_listwise_ap_is_average_precision_where_similarities_lie_on_the_bins():
-    """Signs of 40 entries have similarities of 1, 0.95, ...; oracle: precision at every positive, counted one by one."""
+    """Signs of 40 entries have similarities of 1, 0.95, ...; oracle: precision at every positive, counted."""
     x = np.random.default_rng(4).choice([-1.0, 1.0], (9, 40)) / np.sqrt(40)
     positive = np.zeros((9, 9), bool)
     positive[[0, 1, 0, 2, 3, 4], [1, 0, 2, 0, 4, 3]] = True
