@@ -31,7 +31,7 @@ from pnv_core.describe.model_files import ModelInfo, build_model
 from pnv_core.describe.openvino_describing import head
 from pnv_core.describe.patches import patch_descriptors
 from pnv_core.describe.torch_model import TorchTrunk
-from pnv_core.describe.trunks.compact import compact_trunk
+from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.files import atomic_write
@@ -199,14 +199,15 @@ def trunk_row(name: str, trunk: Trunk, size: tuple[int, int], threads: int, roun
     packed = image.contiguous(memory_format=torch.channels_last)
     channels_last = deepcopy(eager).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     sides: dict[str, Callable[[], Any]] = {
-        "baseline": lambda: eager(image),
-        "channels last": lambda: channels_last(packed),
+        "baseline": lambda: eager.maps(image),
+        "channels last": lambda: channels_last.maps(packed),
     }
     for precision, said in (("float32", "FP32"), ("bfloat16", "BF16")):
         if said in fast_precisions():
             pixels, scaled = image_input(size[1], size[0])
-            output = build((*trunk.layers, *trunk.neck), weights, scaled)
-            compiled = Compiled(partial(ov.Model, [output], [pixels], name), threads, precision)
+            wide = build(trunk.layers, weights, scaled)
+            outputs = [build(after, weights, wide) for after in (trunk.neck, trunk.deep) if after] or [wide]
+            compiled = Compiled(partial(ov.Model, outputs, [pixels], name), threads, precision)
             sides[f"openvino {precision}"] = partial(compiled, rgb)
     return compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
 
@@ -285,7 +286,7 @@ def main() -> int:
         rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
         for scorer in ("ransac", "usac"):
             rows.append(reranking_row(128, scorer, count, args.threads, 1 if args.quick else args.rounds))
-        rows.append(trunk_row("compact trunk", compact_trunk(), (288, 384), args.threads, 5 * args.rounds))
+        rows.append(trunk_row("lite trunk", lite_trunk(0, deep=True), (288, 384), args.threads, 5 * args.rounds))
         sizes = ((320, 240),) if args.quick else ((320, 240), (384, 288), (640, 480))
         rows += [describing_row(size, args.threads, 5 * args.rounds) for size in sizes]
         if not args.quick:

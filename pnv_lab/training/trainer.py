@@ -25,7 +25,7 @@ from pnv_lab.training.journal import Journal
 from pnv_lab.training.losses import listwise_ap, multi_similarity, patch_contrast
 from pnv_lab.training.validation import ValidationSet, describe_all, recalls
 
-LOSSES = {"ms": multi_similarity, "ap": listwise_ap}
+LOSSES: dict[str, Callable[[Tensor, Tensor, Tensor], Tensor]] = {"ms": multi_similarity, "ap": listwise_ap}
 
 
 @dataclass(frozen=True)
