@@ -70,7 +70,7 @@ SLAM = [
 
 RERUN = ["rerun-sdk>=0.24"]  # pnv run --rrd
 
-BRIDGES = ("tf_bridge", "rtabmap_bridge", "hydra_bridge", "swarm_slam_bridge")
+BRIDGES = ("tf_bridge", "rtabmap_bridge", "hydra_bridge", "swarm_slam_bridge", "lio_sam_bridge")
 
 setup(
     name=PACKAGE,

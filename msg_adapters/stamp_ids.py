@@ -9,6 +9,7 @@ import logging
 from bisect import bisect_left, insort
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 from pnv_core.types import LoopClosure
 
@@ -17,13 +18,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class NodePair:
-    """A closure between two nodes of a back end: `query` the newer node, `match` the older, and how far off in time."""
+    """A closure between two nodes of a back end: `query` the newer node, `match` the older, and how far off in time.
+
+    `carried` is what was given with the closure.
+    """
 
     closure: LoopClosure
     query: int
     match: int
     query_offset_ns: int  # node stamp less image stamp
     match_offset_ns: int
+    carried: Any = None
 
 
 class StampIds:
@@ -37,7 +42,7 @@ class StampIds:
         self._wait_ns = round(wait_s * 1e9)
         self._nodes: list[tuple[int, int]] = []  # (stamp, id), by stamp
         self._ids: dict[int, int] = {}  # stamp by id
-        self._waiting: deque[LoopClosure] = deque()
+        self._waiting: deque[tuple[LoopClosure, Any]] = deque()
         self._most_waiting = most_waiting
         self.dropped = 0
 
@@ -59,11 +64,11 @@ class StampIds:
         self._nodes.clear()
         self._ids.clear()
 
-    def add_closure(self, closure: LoopClosure) -> list[NodePair]:
-        """A closure as it was published. Gives what can be handed on now, this one or others."""
-        self._waiting.append(closure)
+    def add_closure(self, closure: LoopClosure, carried: Any = None) -> list[NodePair]:
+        """A closure as it was published, and what goes with it. Gives what can be handed on now, this one or others."""
+        self._waiting.append((closure, carried))
         if len(self._waiting) > self._most_waiting:
-            self._drop(self._waiting.popleft(), f"more than {self._most_waiting} wait")
+            self._drop(self._waiting.popleft()[0], f"more than {self._most_waiting} wait")
         return self._settled()
 
     def nearest(self, stamp_ns: int) -> tuple[int, int] | None:
@@ -79,20 +84,20 @@ class StampIds:
         if not self._nodes:
             return []
         pairs: list[NodePair] = []
-        waiting: deque[LoopClosure] = deque()
+        waiting: deque[tuple[LoopClosure, Any]] = deque()
         newest = self._nodes[-1][0]
-        for closure in self._waiting:
+        for closure, carried in self._waiting:
             query, match = self.nearest(closure.query.stamp_ns), self.nearest(closure.match.stamp_ns)
             if query and match and newest >= closure.query.stamp_ns:  # earlier, a nearer node may still come
                 if query[0] == match[0]:
                     self._drop(closure, f"both images belong to node {query[0]}")
                 else:
-                    pairs.append(NodePair(closure, query[0], match[0], query[1], match[1]))
+                    pairs.append(NodePair(closure, query[0], match[0], query[1], match[1], carried))
             elif newest - closure.query.stamp_ns > self._wait_ns:
                 missing = " and ".join(name for name, found in (("query", query), ("match", match)) if not found)
                 self._drop(closure, f"no node within {self._tolerance_ns / 1e9:g} s of the {missing}")
             else:
-                waiting.append(closure)
+                waiting.append((closure, carried))
         self._waiting = waiting
         return pairs
 

@@ -3,10 +3,13 @@
 pnv_msgs is a package of its own that not every machine has: it is imported when a message is made.
 """
 
+from array import array
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseWithCovariance
+from numpy.typing import NDArray
 
 from msg_adapters.loop_closures import to_time
 from pnv_core.pose.geometry import RelativePose
@@ -52,6 +55,18 @@ def closures_to_typed(
         message.closures.append(typed)
     if closures:
         message.header = message.closures[0].header
+    return message
+
+
+def keyframe_to_typed(ref: ImageRef, vector: NDArray[np.float32], thumbnail: bytes, robot: str = "") -> Any:
+    """A keyframe, its global vector (D,) and small picture -> pnv_msgs/Keyframe.
+
+    Raises ImportError where pnv_msgs is not on the machine.
+    """
+    from pnv_msgs.msg import Keyframe
+
+    message = Keyframe(image=_ref_to_message(ref, robot), descriptor=vector.tolist())
+    message.thumbnail = array("B", thumbnail)
     return message
 
 

@@ -15,6 +15,8 @@ from pnv_core.errors import ConfigError
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, ImageRef, LoopClosure, Query
 
+_LATEST_NS = 2**62  # later than any stamp
+
 
 class PlaceRecognizer:
     """Patch-NetVLAD over a rolling keyframe database, with the settings that its describer was built with.
@@ -87,6 +89,23 @@ class PlaceRecognizer:
         closures = [replace(c, query=query) for c in closures]
         self.sequence.remember(frame.camera, closures, window_of(self.config.consistency + DOUBT))
         return sorted(map(self._decided, closures), key=rank)
+
+    def look_up(self, frame: Frame) -> list[LoopClosure]:
+        """Every candidate for an image by itself, best first; nothing is remembered, no keyframe is too young.
+
+        Without a sequence only `sure_score` accepts. Raises ImageError for an unusable image.
+        """
+        descriptor = self.describer.describe(frame.rgb, frame.valid)
+        if self.config.verify:
+            kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
+            descriptor = replace(descriptor, thumbnail=kept)
+        candidates = self.database.nearest(descriptor.global_vector, self.config.candidates, _LATEST_NS, 0)
+        stored = self.database.readable(ref.id for ref, _ in candidates)
+        candidates = [(ref, similarity) for ref, similarity in candidates if ref.id in stored]
+        query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
+        closures = self.judge.judge(query, descriptor, 1.0, candidates, list(stored.values()), self.config)
+        alone = SequenceMemory(self.database.steps)
+        return sorted((decided(c, self.config, alone) for c in closures), key=rank)
 
     def change(self, **live: Any) -> None:
         """Take these live settings from the next frame on. Raises ConfigError for others and for a wrong value."""

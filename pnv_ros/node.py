@@ -32,6 +32,7 @@ from pnv_ros.services import Services
 from pnv_ros.slot import NewestFrames
 from pnv_ros.stamps import StampRule
 from pnv_ros.statistics import Statistics
+from pnv_ros.typed_services import TypedServices
 from pnv_ros.view import View, read_mask
 from pnv_ros.worker import Worker
 
@@ -63,6 +64,7 @@ class PlaceRecognizerNode(LifecycleNode):
         self._statistics = Statistics()
         self._declared = Parameters(self, lambda: self._recognition is not None, self._settings_changed)
         self._own_services = Services(self, self)
+        TypedServices(self._own_services, self._map_and_recognition)
         # steady: a paused simulation or bag stops neither diagnostics nor the warning that no image comes
         self._second = self.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._service_change_state.callback = self._changing_state(self._service_change_state.callback)
@@ -166,6 +168,11 @@ class PlaceRecognizerNode(LifecycleNode):
             raise PnvError("the node is not active; allowed: activate it first")
         self._inputs.paused = on
         return "paused: images are dropped, the map is kept" if on else "running"
+
+    def _map_and_recognition(self) -> tuple[SavedMap, Recognition]:
+        if self._map is None or self._recognition is None:
+            raise PnvError(NOT_CONFIGURED)
+        return self._map, self._recognition
 
     # Parts
 

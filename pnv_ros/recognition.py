@@ -9,7 +9,7 @@ from rclpy.serialization import deserialize_message
 
 from msg_adapters.images import message_to_frame
 from pnv_core.config import live_settings
-from pnv_core.errors import ImageError
+from pnv_core.errors import ImageError, PnvError
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, LoopClosure
 from pnv_fleet.fleet import Fleet
@@ -81,6 +81,21 @@ class Recognition:
             f"{stats.without_picture} of {stats.keyframes} keyframes have no picture (saved with verify: 0); "
             "patches alone decide on them"
         )
+
+    def where_is(self, image: Any, camera: str) -> list[LoopClosure]:
+        """The places of a sensor_msgs/Image, best first; nothing is added. `camera` is an image topic, '' the first.
+
+        Raises PnvError for another camera, one without its camera info, or an unusable image.
+        """
+        camera = camera or next(iter(self.views))
+        view = self.views.get(camera)
+        if view is None:
+            raise PnvError(f"camera {camera!r} given; allowed: {', '.join(self.views)}, or none for the first")
+        if view.needs_info and view.rectifier is None:
+            raise PnvError(f"{camera} has no camera info yet; allowed: once it came")
+        frame = view(message_to_frame(image, camera))
+        with self._still:
+            return self.recognizer.look_up(frame)
 
     def work(self, waiting: WaitingFrame) -> None:
         """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""

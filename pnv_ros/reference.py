@@ -194,6 +194,12 @@ of the same session: LIO-SAM knows the stamps of its own run only, so nothing is
 | `~/load` | std_srvs/Trigger | replace the map by the one at `map_path`; a new session begins |
 | `~/reset` | std_srvs/Trigger | forget every keyframe, and the stamps seen |
 | `~/pause` | std_srvs/SetBool | drop images until set to false; the map is kept |
+| `~/save_map` | pnv_msgs/SaveMap | `~/save` to another path this once |
+| `~/load_map` | pnv_msgs/LoadMap | `~/load` from another path this once |
+| `~/query_image` | pnv_msgs/QueryImage | the candidates of an image; nothing is added, no keyframe is too young |
+| `~/get_keyframe` | pnv_msgs/GetKeyframe | what a keyframe keeps: image, global vector, small picture |
+
+Those of pnv_msgs are there where pnv_msgs is on the machine. A single image is accepted from `sure_score` on.
 
 Images go on being processed while a map is written or read; `~/load` and `~/reset` wait for the frame in hand.
 `autosave` without `load_on_start` is refused where `map_path` already holds a map, since a map that was not loaded is

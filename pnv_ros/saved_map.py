@@ -31,27 +31,30 @@ class SavedMap:
     def path(self, path: str) -> None:
         if path != self._path:
             self._path = path
-            self._store = (self._used.get(Path(path)) or MapStore(path, self._fingerprint)) if path else None
+            self._store = self._store_at(path) if path else None
 
     def exists(self) -> bool:
         """Whether a map was saved there before."""
         return self._opened().exists()
 
-    def save(self, snapshot: Snapshot | None = None) -> SaveReport:
-        """Save the database, or a snapshot of it. Raises MapError; the map on disk is then as it was."""
-        store = self._opened()
+    def save(self, snapshot: Snapshot | None = None, path: str = "") -> SaveReport:
+        """Save the database, or a snapshot of it, to the path, or another one this once.
+
+        Raises MapError; the map on disk is then as it was.
+        """
+        store = self._opened(path)
         with self._writing:
             report = store.save(snapshot or self._database.snapshot())
             self._used[store.path] = store
             return report
 
-    def load(self, still: AbstractContextManager[object], loaded: Callable[[], None]) -> int:
+    def load(self, still: AbstractContextManager[object], loaded: Callable[[], None], path: str = "") -> int:
         """Replace the database's content and begin a new session; the number of keyframes. Raises MapError.
 
         A save under way is waited for first. Frames go on with the map before until the new one is whole in memory;
-        `still` is entered then and held until `loaded` has returned.
+        `still` is entered then and held until `loaded` has returned. `path` is another one this once.
         """
-        store = self._opened()
+        store = self._opened(path)
         with self._writing:
             manifest, prepared = store.read(self._database)
             with still:
@@ -64,8 +67,11 @@ class SavedMap:
         """Saves every so often once started, and when stopped."""
         return Autosave(self._database, self, interval_s, report)  # type: ignore[arg-type]
 
-    def _opened(self) -> MapStore:
-        store = self._store
+    def _store_at(self, path: str) -> MapStore:
+        return self._used.get(Path(path).absolute()) or MapStore(path, self._fingerprint)
+
+    def _opened(self, path: str = "") -> MapStore:
+        store = self._store_at(path) if path else self._store
         if store is None:
             raise MapError("map_path is empty; allowed: a folder, set by the parameter map_path")
         return store

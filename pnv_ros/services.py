@@ -33,10 +33,9 @@ class Services:
     def __init__(self, node: Node, controls: Controls) -> None:
         self._node = node
         self._pending = 0
-        one_at_a_time = MutuallyExclusiveCallbackGroup()
-        for name in ("save", "load", "reset"):
-            act = self._beside(getattr(controls, name))
-            node.create_service(Trigger, f"~/{name}", act, callback_group=one_at_a_time)
+        self._one_at_a_time = MutuallyExclusiveCallbackGroup()
+        for name, act in (("save", controls.save), ("load", controls.load), ("reset", controls.reset)):
+            self.serve(Trigger, name, _without_arguments(act))
 
         def pause(request: Any, response: Any) -> Any:
             return self._answered(response, _outcome(lambda: controls.pause(request.data)))
@@ -48,17 +47,19 @@ class Services:
         """Whether every call was answered."""
         return self._pending == 0
 
-    def _beside(self, act: Callable[[], str]) -> Callable[..., Any]:
-        async def serve(_: Any, response: Any) -> Any:
-            done = Future()
-            threading.Thread(target=self._run, args=(act, done), name="service", daemon=True).start()
+    def serve(self, kind: type, name: str, act: Callable[[Any, Any], str]) -> None:
+        """A service ~/name: `act` gets request and response in a thread, and gives the sentence of the answer."""
+
+        async def serve(request: Any, response: Any) -> Any:
+            done, work = Future(), lambda: act(request, response)
+            threading.Thread(target=self._run, args=(work, done), name="service", daemon=True).start()
             self._pending += 1
             try:
                 return self._answered(response, await done)
             finally:
                 self._pending -= 1
 
-        return serve
+        self._node.create_service(kind, f"~/{name}", serve, callback_group=self._one_at_a_time)
 
     def _run(self, act: Callable[[], str], done: Future) -> None:
         done.set_result(_outcome(act))
@@ -74,6 +75,10 @@ class Services:
             raise outcome
         response.success, response.message = isinstance(outcome, str), str(outcome)
         return response
+
+
+def _without_arguments(act: Callable[[], str]) -> Callable[[Any, Any], str]:
+    return lambda request, response: act()
 
 
 def _outcome(act: Callable[[], str]) -> str | Exception:

@@ -20,6 +20,9 @@ KERNELS = ("none", "huber", "cauchy", "geman_mcclure", "dcs")
 # Where odometry begins anew, next to nothing is known but the vertical; looser, the solution would lose its digits.
 _AFTER_BREAK = (0.05, 0.05, 1.0, 20.0, 20.0, 20.0)
 _SUPPORT_TOLERANCES = 20.0  # closures support each other within so many tolerances of way
+# Metres and radians a node moves before it is linearised anew; less for a tolerance below a metre. As good as 0.1
+# over an hour with wrong closures, at half the work: worst update 21 for 46 ms (benchmarks/pose_graph.py).
+_RELINEARIZE = 0.5
 _ITERATIONS = 5  # of iSAM2 after a closure, one an update; each relinearises what moved
 
 
@@ -67,7 +70,7 @@ class PoseGraph:
         self._kernel = _kernel(gtsam, kernel)
         self._after_break = gtsam.noiseModel.Diagonal.Sigmas(np.array(_AFTER_BREAK))
         parameters = gtsam.ISAM2Params()
-        parameters.setRelinearizeThreshold(0.1)
+        parameters.setRelinearizeThreshold(min(_RELINEARIZE, _RELINEARIZE * self.noise.tolerance_m))
         parameters.relinearizeSkip = 1
         self._isam = gtsam.ISAM2(parameters)
         self._factors, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()

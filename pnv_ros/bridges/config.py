@@ -91,9 +91,20 @@ class SwarmSlamConfig(BridgeConfig):
     wait_s: float = setting(10.0, "a closure waits until a node is so much newer than it", unit="s", low=0.0, high=1e4)
 
 
-BRIDGE_SETTINGS: dict[str, type[BridgeConfig]] = {
+@dataclass(frozen=True)
+class LioSamConfig:
+    """lio_sam_bridge."""
+
+    pairs_topic: str = setting("place_recognizer/lio_sam", "std_msgs/Float64MultiArray, ~/lio_sam of place_recognizer")
+
+    def __post_init__(self) -> None:
+        checked(self)
+
+
+BRIDGE_SETTINGS: dict[str, type] = {
     "tf_bridge": TfConfig,
     "rtabmap_bridge": RtabmapConfig,
     "hydra_bridge": HydraConfig,
     "swarm_slam_bridge": SwarmSlamConfig,
+    "lio_sam_bridge": LioSamConfig,
 }

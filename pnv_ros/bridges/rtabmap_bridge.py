@@ -33,7 +33,6 @@ class RtabmapBridge(MetricBridge):
             raise ConfigError(f"rtabmap_node = {config.rtabmap_node!r}; allowed: a full name, as /rtabmap/rtabmap")
         self._ids = StampIds(config.tolerance_s, config.wait_s)
         self._stamps: dict[int, int] = {}
-        self._metric: dict[tuple[int, int], MetricClosure] = {}
         self._queue: deque[NodePair] = deque()
         self._asked: NodePair | None = None
         self._asked_at, self._knows_the_map, self._told = 0, False, False
@@ -47,8 +46,7 @@ class RtabmapBridge(MetricBridge):
 
     def take(self, closures: Sequence[MetricClosure]) -> None:
         for closure in closures:
-            self._metric[closure.closure.query.stamp_ns, closure.closure.match.id] = closure
-            self._queue += self._ids.add_closure(closure.closure)
+            self._queue += self._ids.add_closure(closure.closure, closure)
 
     def counts(self) -> str:
         refused = ", ".join(f"{count} refused: {why}" for why, count in sorted(self.refused.items())) or "none refused"
@@ -84,10 +82,8 @@ class RtabmapBridge(MetricBridge):
             self._settle(f"no answer in {_ANSWER_S:.0f} s")
         if self._asked is None and self._queue:
             self._asked, self._asked_at = self._queue.popleft(), now
-            closure = self._asked.closure
-            metric = self._metric.pop((closure.query.stamp_ns, closure.match.id))
             request = self._types.AddLink.Request()
-            fill_link(request.link, self._asked, metric, self.config.m_per_s)
+            fill_link(request.link, self._asked, self._asked.carried, self.config.m_per_s)
             self.sent += 1
             self._add.call_async(request).add_done_callback(self._look)
 

@@ -27,7 +27,6 @@ class SwarmSlamBridge(MetricBridge):
         self._closure_type = messages.IntraRobotLoopClosure
         self._ids = StampIds(self.config.tolerance_s, self.config.wait_s)
         self._stamps: dict[int, int] = {}
-        self._metric: dict[tuple[int, int], MetricClosure] = {}
         qos = QoSProfile(depth=1000)
         self._out = self.create_publisher(self._closure_type, "cslam/intra_robot_loop_closure", qos)
         self.create_subscription(messages.KeyframeOdom, "cslam/keyframe_odom", self._keyframe, qos)
@@ -35,8 +34,7 @@ class SwarmSlamBridge(MetricBridge):
 
     def take(self, closures: Sequence[MetricClosure]) -> None:
         for closure in closures:
-            self._metric[closure.closure.query.stamp_ns, closure.closure.match.id] = closure
-            self._send(self._ids.add_closure(closure.closure))
+            self._send(self._ids.add_closure(closure.closure, closure))
 
     def counts(self) -> str:
         return f"{super().counts()}, {self._ids.dropped} without a keyframe"
@@ -51,13 +49,12 @@ class SwarmSlamBridge(MetricBridge):
 
     def _send(self, pairs: Sequence[NodePair]) -> None:
         for pair in pairs:
-            metric = self._metric.pop((pair.closure.query.stamp_ns, pair.closure.match.id))
             self._out.publish(
                 self._closure_type(
                     keyframe0_id=pair.match,
                     keyframe1_id=pair.query,
                     success=True,
-                    transform=transform_of(metric.relative),
+                    transform=transform_of(pair.carried.relative),
                 )
             )
             self.sent += 1

@@ -2,6 +2,7 @@
 
 import itertools
 import logging
+import weakref
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -130,3 +131,20 @@ def test_the_nearest_node_is_that_of_a_plain_search(stamps, wanted):
     if found:
         assert abs(found[1]) == best
         assert stamps[found[0]] - wanted == found[1]
+
+
+def test_what_goes_with_a_closure_comes_with_its_pair_and_is_let_go_with_a_dropped_one():
+    class Carried:
+        pass
+
+    handed, dropped = Carried(), Carried()
+    gone = weakref.ref(dropped)
+    ids = StampIds(tolerance_s=0.5, wait_s=10.0)
+    ids.add_node(1, 10 * S)
+    ids.add_node(2, 50 * S)
+    assert ids.add_closure(closure(50, 10), handed)[0].carried is handed
+    assert ids.add_closure(closure(55, 30), dropped) == []  # no node at the match
+    del dropped
+    assert gone() is not None
+    ids.add_node(3, 70 * S)
+    assert (ids.dropped, gone()) == (1, None)

@@ -8,8 +8,10 @@ import sys
 
 import numpy as np
 import pytest
+from std_msgs.msg import Float64MultiArray
 
 from msg_adapters.poses import matrix_of_pose, matrix_of_transform
+from pnv_ros.outputs import TABLE_QOS
 from test.bridges.running import METRIC, Recogniser, S, closure, odometry_message, running
 from test.ros.processes import Process, wait_until
 
@@ -153,6 +155,26 @@ def test_swarm_slam_gets_closures_between_its_keyframes(listener):
         np.testing.assert_allclose(matrix_of_transform(message.transform)[:3, 3], AHEAD, atol=1e-6)
     assert "ended: 11 sent, 0 without a measured pose" in bridge.output
     assert "1 without a keyframe" in bridge.output
+
+
+def test_lio_sam_gets_the_last_pairs_once_it_listens(listener):
+    """LIO-SAM, src/mapOptmization.cpp: two doubles, newer and older in seconds; a queue of the last five."""
+    pairs = listener.node.create_publisher(Float64MultiArray, "/place_recognizer/lio_sam", TABLE_QOS)
+    with running("lio_sam_bridge", "hands on /place_recognizer/lio_sam to /lio_loop/loop_closure_detection") as bridge:
+        wait_until(pairs.get_subscription_count, 20, "the bridge")
+        for i in range(7):
+            pairs.publish(Float64MultiArray(data=[100.0 + i, float(i)]))
+        bridge.wait_for("nobody listens on /lio_loop/loop_closure_detection; the last 5 closures are kept")
+        for wrong in ([1.0], [5.0, 90.0], [float("nan"), 1.0]):
+            pairs.publish(Float64MultiArray(data=wrong))
+        bridge.wait_for("allowed: two stamps in seconds, the newer first")
+        received = listener.collect(Float64MultiArray, "/lio_loop/loop_closure_detection", TABLE_QOS)
+        wait_until(lambda: len(received) == 5, 30, "what was kept")
+        pairs.publish(Float64MultiArray(data=[200.0, 50.0]))
+        wait_until(lambda: len(received) == 6, 30, "a pair while LIO-SAM listens")
+        assert bridge.end() == 0
+    assert [list(m.data) for m in received] == [*([100.0 + i, float(i)] for i in range(2, 7)), [200.0, 50.0]]
+    assert "ended: 6 sent, 2 without a listener, 3 malformed" in bridge.output
 
 
 @pytest.mark.parametrize(

@@ -140,6 +140,7 @@ def test_launch_files_name_only_what_exists(path, monkeypatch):
 
 def test_there_is_a_launch_file_for_a_bag_for_two_cameras_and_for_every_bridge():
     assert [p.name for p in LAUNCH_FILES] == [
-        "bag.launch.py", "hydra_bridge.launch.py", "place_recognizer.launch.py", "rtabmap_bridge.launch.py",
+        "bag.launch.py", "hydra_bridge.launch.py", "lio_sam_bridge.launch.py", "place_recognizer.launch.py",
+        "rtabmap_bridge.launch.py",
         "swarm_slam_bridge.launch.py", "tf_bridge.launch.py", "two_cameras.launch.py",
     ]  # fmt: skip
