@@ -3,7 +3,8 @@
 python -m benchmarks.run [--rounds N] [--threads N] [--out DIR]    prints a table, writes DIR/benchmarks.json and plots
 
 Every row is the median over rounds in which both sides took turns, so that a busy machine burdens both; the processor
-time of both is given beside the wall time. A row of the machine says what a large product and a large copy reach.
+time of both is given beside the wall time. A row of the machine says what a large product and a large copy reach; where
+a row's arithmetic is counted, the last column says which share of that its side reaches (1.0: the physical limit).
 """
 
 import argparse
@@ -27,7 +28,7 @@ from benchmarks import baseline
 from benchmarks.growth import measured_growth, plotted
 from pnv_core.config import Config
 from pnv_core.describe.describer import load_describer
-from pnv_core.describe.model_files import ModelInfo, build_model
+from pnv_core.describe.model_files import Model, ModelInfo, build_model
 from pnv_core.describe.openvino_describing import head
 from pnv_core.describe.patches import patch_descriptors
 from pnv_core.describe.torch_model import TorchTrunk
@@ -35,6 +36,7 @@ from pnv_core.describe.trunks.lite import lite_trunk
 from pnv_core.describe.trunks.trunk import Trunk
 from pnv_core.describe.trunks.vgg16 import vgg16_trunk
 from pnv_core.files import atomic_write
+from pnv_core.networks.layers import Add, Block, Concat, Conv, Network, Shape, shape_after
 from pnv_core.networks.openvino_backend import Compiled, build, fast_precisions, image_input
 from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
@@ -134,9 +136,7 @@ def patches_row(clusters: int, dim: int, threads: int, rounds: int) -> dict[str,
         {"baseline": plain, "openvino": lambda: graph(maps, maps, cells), "torch": eager},
         rounds,
     )
-    flops = 2 * clusters * dim * CHANNELS * CELLS[0] * CELLS[1]
-    row["gflops"] = round(flops / row["sides"]["openvino"]["ms"] / 1e6, 1)
-    return row
+    return row | {"gflop": 2e-9 * clusters * (dim + 1) * CHANNELS * CELLS[0] * CELLS[1]}
 
 
 def places(rng: np.random.Generator, count: int, dim: int) -> list[PlaceDescriptor]:
@@ -187,6 +187,36 @@ def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: 
     return compared(f"re-ranking {candidates} candidates, sizes 2, 5, 8, {scorer}, D={dim}", sides, rounds)
 
 
+def gflop(network: Network, shape: Shape) -> float:
+    """Multiplications and additions of the convolutions for an image of (channels, height, width)."""
+    total = 0.0
+    for layer in network:
+        after = shape_after((layer,), shape)
+        match layer:
+            case Conv(kernel=k, groups=groups):
+                total += 2e-9 * np.prod(after) * k * k * shape[0] / groups
+            case Block(layers=layers):
+                total += gflop(layers, shape)
+            case Add(branches=branches) | Concat(branches=branches):
+                total += sum(gflop(branch, shape) for branch in branches)
+        shape = after
+    return float(total)
+
+
+def trunk_gflop(trunk: Trunk, size: tuple[int, int]) -> float:
+    """Of all its parts, for an image of (width, height)."""
+    shape = 3, size[1], size[0]
+    wide = shape_after(trunk.layers, shape)
+    return gflop(trunk.layers, shape) + gflop(trunk.neck, wide) + gflop(trunk.deep, wide)
+
+
+def describing_gflop(model: Model, size: tuple[int, int]) -> float:
+    """Of the trunk, the assignment and the projection of the patches' residuals."""
+    _, h, w = model.trunk.shape(*size)
+    heads = 2e-9 * h * w * model.trunk.channels * model.clusters * (1 + model.patch_dim)
+    return trunk_gflop(model.trunk, size) + heads
+
+
 def trunk_row(name: str, trunk: Trunk, size: tuple[int, int], threads: int, rounds: int) -> dict[str, Any]:
     torch.manual_seed(0)
     eager = TorchTrunk(trunk).eval().requires_grad_(False)
@@ -209,7 +239,8 @@ def trunk_row(name: str, trunk: Trunk, size: tuple[int, int], threads: int, roun
             outputs = [build(after, weights, wide) for after in (trunk.neck, trunk.deep) if after] or [wide]
             compiled = Compiled(partial(ov.Model, outputs, [pixels], name), threads, precision)
             sides[f"openvino {precision}"] = partial(compiled, rgb)
-    return compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
+    row = compared(f"{name} at {size[1]}x{size[0]}", sides, rounds)
+    return row | {"gflop": trunk_gflop(trunk, (size[1], size[0]))}
 
 
 def describing_row(size: tuple[int, int], threads: int, rounds: int) -> dict[str, Any]:
@@ -221,7 +252,8 @@ def describing_row(size: tuple[int, int], threads: int, rounds: int) -> dict[str
             image_width=size[0], image_height=size[1], threads=threads, backend=backend, trunk_precision=precision
         )
         sides[f"{backend} {precision}"] = partial(describer.describe, rgb)
-    return compared(f"describe() at {size[0]}x{size[1]}", sides, rounds)
+    row = compared(f"describe() at {size[0]}x{size[1]}", sides, rounds)
+    return row | {"gflop": describing_gflop(describer.model, size)}
 
 
 def roofline(threads: int) -> dict[str, Any]:
@@ -258,15 +290,17 @@ def machine() -> dict[str, Any]:
     return {"processor": model, "cores": torch.get_num_threads(), "torch": torch.__version__, "numpy": np.__version__}
 
 
-def table(rows: list[dict[str, Any]]) -> str:
+def table(rows: list[dict[str, Any]], peak: dict[str, float]) -> str:
     lines = [
-        "| what | " + " | ".join(["side", "ms", "ratio", "processor ms", "processor ratio"]) + " |",
-        "|---|---|---:|---:|---:|---:|",
+        "| what | " + " | ".join(["side", "ms", "ratio", "processor ms", "processor ratio", "of the limit"]) + " |",
+        "|---|---|---:|---:|---:|---:|---:|",
     ]
     for row in rows:
         for side, v in row["sides"].items():
-            figures = (f"{v[key]:.1f}" for key in ("ms", "ratio", "cpu_ms", "cpu_ratio"))
-            lines.append("| " + " | ".join([row["name"], side, *figures]) + " |")
+            figures = [f"{v[key]:.1f}" for key in ("ms", "ratio", "cpu_ms", "cpu_ratio")]
+            most = peak["bfloat16_gflops" if "bfloat16" in side else "float32_gflops"]
+            share = f"{row['gflop'] / most / v['ms'] * 1e3:.2f}" if "gflop" in row and side != "baseline" else ""
+            lines.append("| " + " | ".join([row["name"], side, *figures, share]) + " |")
     return "\n".join(lines)
 
 
@@ -287,7 +321,7 @@ def main() -> int:
         for scorer in ("ransac", "usac"):
             rows.append(reranking_row(128, scorer, count, args.threads, 1 if args.quick else args.rounds))
         rows.append(trunk_row("lite trunk", lite_trunk(0, deep=True), (288, 384), args.threads, 5 * args.rounds))
-        sizes = ((320, 240),) if args.quick else ((320, 240), (384, 288), (640, 480))
+        sizes = ((384, 288),) if args.quick else ((320, 240), (384, 288), (640, 480))
         rows += [describing_row(size, args.threads, 5 * args.rounds) for size in sizes]
         if not args.quick:
             rows.append(trunk_row("VGG16", vgg16_trunk(), (480, 640), args.threads, args.rounds))
@@ -298,7 +332,7 @@ def main() -> int:
         file.write((json.dumps(report, indent=1) + "\n").encode())
     if growth:
         plotted(growth, args.out / "growth.png")
-    print(table(rows))
+    print(table(rows, peak))
     print(f"written to {args.out}")
     return 0
 

@@ -161,7 +161,7 @@ def _measure(config: Config, images: Sequence[NDArray[np.uint8]], seconds: float
     """Every scorer at one image size."""
     results = []
     for scorer in _SCORERS if config.scorer != "rapid" else (config.scorer,):
-        recognizer = _recogniser(config.replace(scorer=scorer), images)
+        recognizer = filled_recogniser(config.replace(scorer=scorer), images)
         few, many = (_median_ms(_frames(recognizer, images, candidates), seconds) for candidates in _TIMED)
         each = max(many - few, 0.0) / (_TIMED[1] - _TIMED[0])
         kilobytes = recognizer.database.bytes_used / len(recognizer.database) / 1e3
@@ -170,7 +170,7 @@ def _measure(config: Config, images: Sequence[NDArray[np.uint8]], seconds: float
     return results
 
 
-def _recogniser(config: Config, images: Sequence[NDArray[np.uint8]]) -> "PlaceRecognizer":
+def filled_recogniser(config: Config, images: Sequence[NDArray[np.uint8]]) -> "PlaceRecognizer":
     """For which every frame is a keyframe, over a map of the images' descriptors, slightly turned."""
     from pnv_core.describe.describer import describer_from
     from pnv_core.recognizer import PlaceRecognizer
@@ -216,7 +216,7 @@ def _proposed(config: Config, chosen: Measured, candidates: int) -> Config:
 
 def _run_proposal(config: Config, images: Sequence[NDArray[np.uint8]], rate: float) -> Check:
     """Frames at the rate, or somewhat sooner where it is low."""
-    work = _frames(_recogniser(config, images), images, config.candidates)
+    work = _frames(filled_recogniser(config, images), images, config.candidates)
     work(0)
     spent: list[float] = []
     period = 1.0 / rate

@@ -1,7 +1,6 @@
 """Describer: an image to a PlaceDescriptor. D dimensions, P patch sizes."""
 
 import hashlib
-import math
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,7 +14,6 @@ from pnv_core.describe.checkpoints import load_checkpoint
 from pnv_core.describe.download import cache_folder, resolve_weights
 from pnv_core.describe.model_files import Model, load_model, save_model
 from pnv_core.errors import ConfigError, ImageError, ModelError
-from pnv_core.threads import Workers, spans, workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
 _TEXTURE_PX = 16  # side of the squares that count as textured or not
@@ -109,7 +107,6 @@ class Describer:
         self.backend = backend_of(self.config)
         self.fingerprint = model.fingerprint()
         self._describing = _describing(model, self.config)
-        self._workers = workers(self.config.threads)
 
     @property
     def cell(self) -> int:
@@ -143,7 +140,7 @@ class Describer:
         The image is resized to the configured size without keeping its aspect (as the reference does).
         Raises ImageError for any other array.
         """
-        pixels = resized(checked_image(rgb), *self.image_size, self._workers)
+        pixels = resized(checked_image(rgb), *self.image_size)
         cells = None if valid is None else _valid_cells(valid, self.cells)
         vector, arrays = self._describing.describe(pixels, cells)
         patches = tuple(
@@ -165,20 +162,11 @@ def checked_image(rgb: Any) -> NDArray[np.uint8]:
     return rgb
 
 
-def resized(rgb: NDArray[np.uint8], width: int, height: int, pool: Workers | None = None) -> NDArray[np.uint8]:
-    """Bilinear with anti-aliasing and 8-bit rounding, as the reference resizes (Pillow). `pool` shares the rows out."""
+def resized(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
+    """Bilinear with anti-aliasing and 8-bit rounding, as the reference resizes (Pillow)."""
     if rgb.shape[:2] == (height, width):
         return rgb
-    image, (rows, columns) = Image.fromarray(rgb), rgb.shape[:2]
-
-    def band(span: tuple[int, int]) -> NDArray[np.uint8]:
-        box = (0, span[0] * rows // height, columns, span[1] * rows // height)
-        return np.asarray(image.resize((width, span[1] - span[0]), Image.Resampling.BILINEAR, box))
-
-    if pool is None or rows < height:
-        return band((0, height))
-    bands = spans(height, pool.threads, height // math.gcd(rows, height))  # cut at whole rows of both
-    return np.concatenate(pool.map(band, bands))
+    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling.BILINEAR))
 
 
 def texture(pixels: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> float:

@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pnv_core import KeyframeDatabase, MapStore, load_describer
-from pnv_core.describe.describer import resized
 from pnv_core.describe.model_files import ModelInfo, build_model
 from pnv_core.describe.openvino_describing import head
 from pnv_core.describe.patches import patch_descriptors
@@ -176,14 +175,6 @@ def test_halves_are_unpacked_to_the_bit():
     values = np.arange(2**16, dtype=np.uint16).view(np.float16)
     finite = values[np.isfinite(values)].reshape(-1, 2)
     assert np.array_equal(patch_rows(finite).view(np.uint32), finite.astype(np.float32).view(np.uint32))
-
-
-@pytest.mark.parametrize("given", [(480, 640), (720, 1280), (479, 641), (240, 320), (1080, 1920)])
-def test_rows_shared_out_are_resized_as_all_at_once(given):
-    image = np.random.default_rng(7).integers(0, 256, (*given, 3), np.uint8)
-    for width, height in ((384, 288), (320, 240)):
-        for threads in (2, 3):
-            assert np.array_equal(resized(image, width, height, workers(threads)), resized(image, width, height))
 
 
 @pytest.mark.parametrize("settings", [{}, {"image_width": 650, "image_height": 490, "patch_sizes": (2, 5)}])
