@@ -1,0 +1,96 @@
+"""A frame of the default recogniser, stage by stage, over 1,000 keyframes with 10 candidates and local features.
+
+    python -m benchmarks.stages [--frames N] [--images DIR] [NAME=VALUE ...]
+
+Wall and processor milliseconds, medians, in one process without ROS: what the node does between taking a message and
+publishing. `rest` is what no stage has: keyframe selection, and what is kept for local features. The last column is the
+time that the stage's multiplications and additions would take at the rate of a large product in the same run.
+"""
+
+import argparse
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+
+from benchmarks.live_node import pictures
+from benchmarks.run import describing_gflop, machine, roofline
+from msg_adapters.images import message_to_frame
+from pnv_cli.bench import filled_recogniser
+from pnv_core.config import Config
+from pnv_core.describe.describer import resized, texture
+from pnv_core.timing import StageTimer
+
+_STAGES = ("retrieve", "rerank")
+
+
+def medians(functions: dict[str, Callable[[int], Any]], frames: int) -> dict[str, tuple[float, float]]:
+    """Wall and processor milliseconds of each, in turns."""
+    taken: dict[str, list[tuple[float, float]]] = {name: [] for name in functions}
+    for number in range(-3, frames):
+        for name, function in functions.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            function(number)
+            spent = time.perf_counter() - wall, time.process_time() - cpu
+            if number >= 0:
+                taken[name].append(spent)
+    return {name: tuple(1e3 * np.median(times, axis=0)) for name, times in taken.items()}  # type: ignore[misc]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=60)
+    parser.add_argument("--images", type=Path)
+    parser.add_argument("parameters", nargs="*", metavar="NAME=VALUE")
+    args = parser.parse_args()
+    given = {name: yaml.safe_load(value) for name, value in (item.split("=", 1) for item in args.parameters)}
+    config = Config.make(**given)
+    images = pictures(args.images, 640, 480)
+    recognizer = filled_recogniser(config, images)
+    describer, header = recognizer.describer, SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0))
+    raw, jpeg, inputs = [], [], []
+    for rgb in images:
+        step = {"height": 480, "width": 640, "step": 3 * 640, "is_bigendian": 0}
+        raw.append(SimpleNamespace(header=header, encoding="rgb8", data=rgb.tobytes(), **step))
+        data = cv2.imencode(".jpg", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes()
+        jpeg.append(SimpleNamespace(header=header, format="jpeg", data=data))
+        inputs.append(resized(rgb, *describer.image_size))
+    timers = {"wall": StageTimer(time.perf_counter), "cpu": StageTimer(time.process_time)}
+
+    def process(number: int, clock: str = "wall") -> None:
+        recognizer.timer = timers[clock]
+        recognizer.keyframes.forget()
+        recognizer.process(message_to_frame(raw[number % len(raw)], "0"))
+
+    found = medians(
+        {
+            "decode raw": lambda i: message_to_frame(raw[i % len(raw)], "0"),
+            "decode JPEG": lambda i: message_to_frame(jpeg[i % len(jpeg)], "0", recognizer.enough),
+            "resize": lambda i: resized(images[i % len(images)], *describer.image_size),
+            "network": lambda i: describer._describing.describe(inputs[i % len(inputs)]),
+            "texture": lambda i: texture(inputs[i % len(inputs)]),
+            "whole frame, raw": process,
+            "again": lambda i: process(i, "cpu"),
+        },
+        args.frames,
+    )
+    for stage in _STAGES:
+        found[stage] = tuple(1e3 * float(np.median(timers[c].durations[stage])) for c in ("wall", "cpu"))  # type: ignore
+    parts = ("decode raw", "resize", "network", "texture", *_STAGES)
+    whole = found["whole frame, raw"]
+    found["rest"] = tuple(whole[i] - sum(found[p][i] for p in parts) for i in (0, 1))  # type: ignore[assignment]
+    peak = roofline(config.threads or 1)["float32_gflops"]
+    limit = {"network": 1e3 * describing_gflop(describer.model, describer.image_size) / peak}
+    print(f"{machine()}\n| stage | ms | processor ms | at the limit |\n|---|---:|---:|---:|")
+    for name in ("decode JPEG", *parts, "rest", "whole frame, raw"):
+        least = f"{limit[name]:.1f} ms" if name in limit else ""
+        print(f"| {name} | {found[name][0]:.1f} | {found[name][1]:.1f} | {least} |")
+
+
+if __name__ == "__main__":
+    main()
