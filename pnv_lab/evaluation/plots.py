@@ -131,6 +131,8 @@ def _axes(x: Axis, y: Axis | None = None) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(4.8, 3.1), layout="constrained")
     axes = figure.add_subplot()
     axes.set(xlabel=x.title, xlim=(x.low, x.high), xscale="log" if x.log else "linear")
+    if not x.log:
+        axes.xaxis.set_major_locator(MaxNLocator(6))
     if y is not None:
         axes.set(ylabel=y.title, ylim=(y.low, y.high))
     return figure, axes

@@ -49,7 +49,7 @@ th:first-child{background:var(--panel)}td small{color:var(--soft)}td b{color:#0a
 .charts{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,420px),1fr));gap:16px}
 figure{margin:0;border:1px solid var(--line);border-radius:8px;padding:10px;background:var(--panel)}
 figure svg,figure img{width:100%;height:auto;display:block}
-svg{color:var(--soft)}details{margin:.4em 0}summary{cursor:pointer}
+svg{color:var(--soft)}details{margin:.4em 0}summary{cursor:pointer;font-weight:600}
 figcaption{font-size:.8rem;color:var(--soft);margin-top:6px}
 .legend span{display:inline-flex;align-items:center;margin-right:14px}
 .legend i{width:12px;height:12px;border-radius:3px;margin-right:6px;display:inline-block}
