@@ -19,6 +19,13 @@ TORCH := torch==2.13.0
 TORCH_CPU := https://download.pytorch.org/whl/cpu
 REACHABLE = $(PYTHON) -c "import urllib.request as r; r.urlopen('$(TORCH_CPU)/torch/', timeout=5)" 2>/dev/null
 
+SHELL := /bin/bash -o pipefail
+# pip, which says on a terminal what it is at, on one line; elsewhere nothing but errors.
+PIP = pip() { if [ -t 1 ]; then $(BIN)/pip install --progress-bar off "$$@" | while read -r word what _; do \
+    case $$word in Collecting|Downloading|Installing) printf '\r\033[K    %.70s' "$$word $$what";; esac; done; \
+    local code=$$?; printf '\r\033[K'; return $$code; \
+    else $(BIN)/pip install --progress-bar off -q "$$@"; fi; }
+
 .PHONY: install shell demo slam-demo fleet-demo test faults soak bench docs lint clean
 
 install: $(READY) $(MESSAGES)
@@ -27,11 +34,10 @@ $(READY): setup.py setup.cfg pyproject.toml
 	@echo "installing into .venv: ROS 2, torch and the tools, a few minutes and about 2 GB"
 	@test -x $(BIN)/python || $(PYTHON) -m venv .venv || \
 	    { echo "python3 -m venv failed; on Debian: apt-get install python3-venv" >&2; exit 2; }
-	@$(BIN)/python -c "import torch" 2>/dev/null || { echo "  torch"; \
-	    if $(REACHABLE); then $(BIN)/pip install --progress-bar off -q $(TORCH) --extra-index-url $(TORCH_CPU); \
-	    else $(BIN)/pip install --progress-bar off -q $(TORCH); fi; }
+	@$(PIP); $(BIN)/python -c "import torch" 2>/dev/null || { echo "  torch"; \
+	    if $(REACHABLE); then pip $(TORCH) --extra-index-url $(TORCH_CPU); else pip $(TORCH); fi; }
 	@echo "  rclpy, the message packages and the tools"
-	@$(BIN)/pip install --progress-bar off -q -e ".[ros,dev,interfaces]"
+	@$(PIP); pip -e ".[ros,dev,interfaces]"
 	@touch $@
 	@echo "installed; for pnv and place_recognizer on the PATH: source .venv/bin/activate, or make shell"
 
