@@ -8,6 +8,7 @@ views of its own images). `report`: webcams, essex, gardens and donkey; every lo
 "patches" ranks by the spatial score alone (the paper), "re-ranked" by all evidence, as the recogniser does, but for
 local features. Baselines: the untrained trunk with GeM and with NetVLAD from k-means (no PCA), dense RootSIFT VLAD,
 each with a vocabulary fitted to the training photographs. Intervals are Wilson's, 95 %. Queries are drawn by --seed.
+`--methods fitted`: the default model as `pnv fit` adapts it to each set's references.
 """
 
 import argparse
@@ -25,10 +26,10 @@ from pnv_core.config import Config
 from pnv_core.decide.judge import Judge
 from pnv_core.describe.describer import Describer, describer_from, resized
 from pnv_core.describe.netvlad import NetVLAD, gem
-from pnv_core.describe.torch_model import TorchTrunk
+from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.types import ImageRef, PlaceDescriptor
-from pnv_lab.fit import FitOptions, as_batch, image_files, read_rgb, vocabulary_of
+from pnv_lab.fit import FitOptions, adapt_model, as_batch, image_files, neighbours, read_rgb, vocabulary_of
 from pnv_lab.training.initial import imagenet_trunk
 from pnv_lab.training.sources import is_held, load_set
 from pnv_lab.training.validation import synthetic_queries
@@ -205,6 +206,20 @@ def orders(
     return {"global": order, "patches": spatial, "re-ranked": better}
 
 
+def with_fitted(describer: Describer, known: RecallSet) -> list[tuple[str, list[float]]]:
+    """The global vector of the default model as `pnv fit` adapts it to the set's references, pairs by name."""
+    files = [image for image in known.references if isinstance(image, Path)]
+    if len(files) < len(known.references):
+        return []
+    model = adapt_model(TorchModel.of(describer.model), files, neighbours(files)).model()
+    fitted = Describer(model, describer.config)
+    vectors = [
+        np.stack([fitted.describe(pixels(image, fitted.image_size)).global_vector for image in part])
+        for part in (known.queries, known.references)
+    ]
+    return [("default, fitted, global", recalls(ranked(*vectors, known.counted), known.truth))]
+
+
 def opened(args: argparse.Namespace) -> Iterator[RecallSet]:
     for name in DEV if args.part == "dev" else REPORT:
         folder = args.data / name
@@ -243,7 +258,8 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     plain = baselines(args)
     describer = None
-    if "default" in args.methods.split(","):
+    methods = args.methods.split(",")
+    if {"default", "fitted"} & set(methods):
         describer = describer_from(Config.make(weights=args.weights, threads=args.threads))
     table = []
     print(f"{'set':34}{'queries':>8}  {'method':28}" + "".join(f"{f'R@{n}':>7}" for n in RECALLS) + "   R@1, 95 %")
@@ -253,7 +269,8 @@ def main() -> None:
             q, r = (baseline_vectors(trunk, heads, images) for images in (known.queries, known.references))
             rows += [(h, recalls(ranked(q[h], r[h], known.counted), known.truth)) for h in heads]
         if describer is not None:
-            rows += with_default(describer, known, args.depth)
+            rows += with_default(describer, known, args.depth) if "default" in methods else []
+            rows += with_fitted(describer, known) if "fitted" in methods else []
         if known.name == "viewpoint_places":
             rows += [(method, [share]) for method, share in PUBLISHED.items()]
         for method, found in rows:

@@ -33,6 +33,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         action="store_true",
         help="a new vocabulary and PCA instead of adapting the model's; what its training learned there is lost",
     )
+    parser.add_argument(
+        "--poses", metavar="FILE", help="where the images were taken (column frame): those near one another show one "
+        "place; without it, those that follow one another by name in a folder"
+    )  # fmt: skip
     parser.add_argument("--clusters", type=int, help="K; default: the model's, or 16")
     parser.add_argument("--global-dim", type=int, help="D of the global vector; default: the model's, or 512")
     parser.add_argument("--patch-dim", type=int, help="D of patches; default: the model's, or 64")
@@ -58,7 +62,8 @@ def run(args: argparse.Namespace) -> int:
     from pnv_core.describe.model_files import ModelInfo, load_model, save_model
     from pnv_core.describe.torch_model import TorchModel, TorchTrunk
     from pnv_core.describe.trunks import TRUNKS
-    from pnv_lab.fit import adapt_model, fit_model, image_files
+    from pnv_lab.fit import adapt_model, fit_model, image_files, neighbours, neighbours_by_pose
+    from pnv_lab.poses import read_poses
 
     output = writable(args.output)
     torch.set_num_threads(max(args.threads, 1))
@@ -80,7 +85,8 @@ def run(args: argparse.Namespace) -> int:
         assert base is not None
         adapted = TorchModel.of(base)
         adapted.trunk.to(args.device)
-        model = adapt_model(adapted, files, _bar)
+        pairs = neighbours_by_pose(files, read_poses(args.poses)) if args.poses else neighbours(files)
+        model = adapt_model(adapted, files, pairs, _bar)
     what = "vocabulary and projections fitted" if anew else "global projection adapted"
     source = (args.trunk if base is None else base.info.provenance or base.info.trunk).strip()
     provenance = f"{what} to {len(files)} images by pnv fit; before: {source}"

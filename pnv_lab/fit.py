@@ -5,6 +5,7 @@ K clusters, C channels, D dimensions, M samples.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,11 @@ from pnv_core.describe.patches import patch_vlads
 from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.errors import ModelError
 from pnv_core.images import SUFFIXES, read_image
+from pnv_lab.poses import Poses
 
-SHRINKAGE = 0.9  # of the whitening that adapts a trained projection; less of it forgets what training learned
+SHRINKAGE = 0.8  # of the whitening that adapts a trained projection; less of it forgets what training learned
+SAME_M, SAME_DEG = 1.0, 20.0  # between two looks at one place
+NEIGHBOURS = 3  # that an image is paired with, at most
 SAMPLES_PER_DIMENSION = 4  # images a whitened principal direction is estimated from; with fewer it is mostly noise
 Progress = Callable[[Iterable[Path], str], Iterable[Path]]
 
@@ -234,30 +238,64 @@ def fit_vocabulary(
     return vocabulary_of((features_of(trunk, file, options) for file in progress(files, "vocabulary")), options)
 
 
-@torch.no_grad()
-def adapted_projection(projection: Projection, vlads: Tensor, shrinkage: float = SHRINKAGE) -> Projection:
-    """A trained projection centred and gently whitened on the images' VLADs (M, K * C); D stays.
+def neighbours(files: Sequence[Path]) -> Tensor:
+    """Pairs (P, 2) of images that follow one another by name in one folder: two looks at one place."""
+    first = torch.tensor([i for i, (a, b) in enumerate(pairwise(files)) if a.parent == b.parent], dtype=torch.long)
+    return torch.stack([first, first + 1], dim=1)
 
-    The covariance of what it gives is shrunk towards a multiple of the identity before its inverse root is taken.
+
+def neighbours_by_pose(files: Sequence[Path], poses: Poses) -> Tensor:
+    """Pairs (P, 2) of images of one place: each with its nearest few within SAME_M and SAME_DEG.
+
+    Raises ModelError where no pair is near.
     """
-    projected = F.linear(vlads, projection.weight, projection.bias)
-    mean = projected.mean(0)
-    covariance = torch.cov(projected.T.double())
-    level = covariance.trace() / len(covariance)
-    shrunk = (1 - shrinkage) * covariance + shrinkage * level * torch.eye(len(covariance), dtype=torch.float64)
-    values, vectors = torch.linalg.eigh(shrunk / level)
+    known = [(i, row) for i, file in enumerate(files) if (row := poses.row(file.name, 0)) is not None]
+    places = poses.positions[[row for _, row in known]].reshape(-1, 3)
+    pairs = set()
+    for a, (image, row) in enumerate(known):
+        away = np.linalg.norm(places - places[a], axis=1)
+        near = [b for b in np.argsort(away, kind="stable") if b != a and away[b] <= SAME_M]
+        alike = [known[b][0] for b in near if poses.turn_deg(row, known[b][1]) <= SAME_DEG]
+        pairs |= {(min(image, other), max(image, other)) for other in alike[:NEIGHBOURS]}
+    if not pairs:
+        raise ModelError(
+            f"{poses.path}: no two of {len(files)} images were taken within {SAME_M:g} m and {SAME_DEG:g} deg"
+        )
+    return torch.tensor(sorted(pairs), dtype=torch.long)
+
+
+@torch.no_grad()
+def adapted_projection(
+    projection: Projection, samples: Tensor, pairs: Tensor, shrinkage: float = SHRINKAGE
+) -> Projection:
+    """A projection that also whitens how two looks at one place differ here; D stays, and so does what is zero.
+
+    samples (M, inputs), pairs (P, 2) rows of samples. The scatter within pairs, of what the projection gives, is
+    shrunk towards a multiple of the identity before its inverse root is taken: learned whitening once more, from the
+    user's places, after that of the model.
+    """
+    projected = F.linear(samples, projection.weight, projection.bias)
+    apart = (projected[pairs[:, 0]] - projected[pairs[:, 1]]).double()
+    scatter = apart.T @ apart / (2 * len(pairs))
+    level = scatter.trace() / len(scatter)
+    if not level > 0:
+        return projection
+    shrunk = (1 - shrinkage) * scatter / level + shrinkage * torch.eye(len(scatter), dtype=torch.float64)
+    values, vectors = torch.linalg.eigh(shrunk)
     whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
-    return projection_of(whitening @ projection.weight, whitening @ (projection.bias - mean))
+    return projection_of(whitening @ projection.weight, whitening @ projection.bias)
 
 
 @torch.no_grad()
-def adapt_model(model: TorchModel, files: Sequence[Path], progress: Progress = plain_progress) -> TorchModel:
-    """The model with its global projection adapted to the images; trunk, vocabulary and patches stay as trained.
+def adapt_model(
+    model: TorchModel, files: Sequence[Path], pairs: Tensor, progress: Progress = plain_progress
+) -> TorchModel:
+    """The model with its global projections adapted to the images; trunk, vocabulary and patches stay as trained.
 
-    Raises ModelError for fewer than eight images.
+    pairs (P, 2) numbers of files that show one place. Raises ModelError for fewer than eight of them.
     """
-    if len(files) < 8:
-        raise ModelError(f"{len(files)} images are too few to adapt to; allowed: 8 or more")
+    if len(pairs) < 8:
+        raise ModelError(f"{len(pairs)} pairs of images of one place are too few to adapt to; allowed: 8 or more")
     options = FitOptions(image_width=model.info.image_width, image_height=model.info.image_height)
     model.trunk.eval()
     vlads, pooled = [], []
@@ -265,8 +303,8 @@ def adapt_model(model: TorchModel, files: Sequence[Path], progress: Progress = p
         features, wide = maps_of(model.trunk, file, options)
         vlads.append(model.netvlad(features.cpu())[0])
         pooled.append(gem(wide.cpu())[0])
-    whole = adapted_projection(model.global_projection, torch.stack(vlads))
-    beside = model.pooled_projection and adapted_projection(model.pooled_projection, torch.stack(pooled))
+    whole = adapted_projection(model.global_projection, torch.stack(vlads), pairs)
+    beside = model.pooled_projection and adapted_projection(model.pooled_projection, torch.stack(pooled), pairs)
     return replace(model, global_projection=whole, patch_projection=model.patches_projection, pooled_projection=beside)
 
 

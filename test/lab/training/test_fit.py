@@ -1,3 +1,5 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,17 @@ from pnv_core.describe.netvlad import Projection, alpha_rule
 from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.errors import ModelError
-from pnv_lab.fit import FitOptions, adapted_projection, fit_model, image_files, pca, spherical_kmeans
+from pnv_lab.fit import (
+    FitOptions,
+    adapted_projection,
+    fit_model,
+    image_files,
+    neighbours,
+    neighbours_by_pose,
+    pca,
+    spherical_kmeans,
+)
+from pnv_lab.poses import read_poses
 
 
 def test_kmeans_finds_directions_that_are_there():
@@ -58,13 +70,27 @@ def test_a_rootsift_model_is_fitted_saved_and_loaded(picture_folder, tmp_path):
     assert again.info.patch_sizes == (2, 3)
 
 
-def test_adapting_without_shrinkage_whitens_and_with_full_shrinkage_only_centres():
-    samples = torch.randn(200, 6, generator=torch.Generator().manual_seed(4)) * torch.tensor([5.0, 3, 1, 1, 1, 1]) + 2
+def test_adapting_whitens_how_two_looks_at_a_place_differ():
+    """Looks differ five times as much along the first axis; oracle: their covariance is isotropic afterwards."""
+    generator = torch.Generator().manual_seed(4)
+    places = torch.randn(300, 6, generator=generator)
+    looks = [places + torch.randn(300, 6, generator=generator) * torch.tensor([5.0, 1, 1, 1, 1, 1]) for _ in "ab"]
+    pairs = torch.arange(300)[:, None] + torch.tensor([0, 300])
     identity = Projection(6, 6)
-    identity.load_state_dict({"weight": torch.eye(6), "bias": torch.zeros(6)})
-    white = adapted_projection(identity, samples, shrinkage=0.0)
-    covariance = torch.cov((samples @ white.weight.T + white.bias).T)
-    assert torch.allclose(covariance, covariance[0, 0] * torch.eye(6), atol=1e-2 * covariance[0, 0].item())
-    centred = adapted_projection(identity, samples, shrinkage=1.0)
-    assert torch.allclose(centred.weight, torch.eye(6), atol=1e-5)
-    assert torch.allclose(centred.bias, -samples.mean(0), atol=1e-5)
+    identity.load_state_dict({"weight": torch.eye(6), "bias": torch.ones(6)})
+    white = adapted_projection(identity, torch.cat(looks), pairs, shrinkage=0.0)
+    apart = (looks[0] - looks[1]) @ white.weight.T
+    assert torch.allclose(apart.T @ apart / 600, torch.eye(6) * (apart**2).sum() / 3600, atol=1e-3)
+    kept = adapted_projection(identity, torch.cat(looks), pairs, shrinkage=1.0)
+    assert torch.allclose(kept.weight, torch.eye(6), atol=1e-5)
+    assert torch.allclose(kept.bias, torch.ones(6), atol=1e-5)
+
+
+def test_pairs_follow_one_another_in_a_folder_or_are_near_by_pose(tmp_path):
+    files = [Path("a/0.png"), Path("a/1.png"), Path("b/2.png"), Path("b/3.png")]
+    assert neighbours(files).tolist() == [[0, 1], [2, 3]]
+    csv = tmp_path / "poses.csv"
+    csv.write_text("frame,x,y,yaw\n0.png,0,0,0\n1.png,0.5,0,2\n2.png,0.6,0,0.1\n3.png,9,0,0\n")
+    assert neighbours_by_pose(files, read_poses(csv)).tolist() == [[0, 2]]
+    with pytest.raises(ModelError, match="within 1 m"):
+        neighbours_by_pose(files[2:], read_poses(csv))
