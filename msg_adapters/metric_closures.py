@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pnv_core.rotations import inverse, transported
 from pnv_core.types import LoopClosure
 
 Array = NDArray[np.float64]
@@ -68,6 +69,5 @@ class MetricClosures:
         return []
 
     def _joined(self, closure: LoopClosure, camera: Array, covariance: Array) -> MetricClosure:
-        turn = np.kron(np.eye(2), self._mount[:3, :3])
-        relative = self._mount @ camera @ np.linalg.inv(self._mount)
-        return MetricClosure(closure, relative, turn @ covariance @ turn.T)
+        back = inverse(self._mount)
+        return MetricClosure(closure, self._mount @ camera @ back, transported(covariance, camera, self._mount, back))

@@ -7,9 +7,9 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, Transform, TransformStamped
 from nav_msgs.msg import Path
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from msg_adapters.loop_closures import to_time
+from pnv_core.rotations import matrix_of, quaternion_of, rigid
 
 Array = NDArray[np.float64]
 
@@ -17,20 +17,20 @@ Array = NDArray[np.float64]
 def matrix_of_pose(pose: Any) -> Array:
     """geometry_msgs/Pose -> (4, 4); NaN where the quaternion has no length."""
     q, p = pose.orientation, pose.position
-    return _matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+    return rigid(matrix_of((q.x, q.y, q.z, q.w)), (p.x, p.y, p.z))
 
 
 def matrix_of_transform(transform: Any) -> Array:
     """geometry_msgs/Transform -> (4, 4); NaN where the quaternion has no length."""
     q, t = transform.rotation, transform.translation
-    return _matrix((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
+    return rigid(matrix_of((q.x, q.y, q.z, q.w)), (t.x, t.y, t.z))
 
 
 def set_pose(pose: Any, matrix: Array) -> None:
     """Fill a geometry_msgs/Pose."""
     pose.position.x, pose.position.y, pose.position.z = (float(v) for v in matrix[:3, 3])
     q = pose.orientation
-    q.x, q.y, q.z, q.w = (float(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_quat())
+    q.x, q.y, q.z, q.w = (float(v) for v in quaternion_of(matrix[:3, :3]))
 
 
 def transform_of(matrix: Array) -> Transform:
@@ -38,7 +38,7 @@ def transform_of(matrix: Array) -> Transform:
     transform = Transform()
     t, q = transform.translation, transform.rotation
     t.x, t.y, t.z = (float(v) for v in matrix[:3, 3])
-    q.x, q.y, q.z, q.w = (float(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_quat())
+    q.x, q.y, q.z, q.w = (float(v) for v in quaternion_of(matrix[:3, :3]))
     return transform
 
 
@@ -61,12 +61,3 @@ def path_message(stamps_ns: Sequence[int], poses: Array, frame: str) -> Path:
         set_pose(item.pose, matrix)
         message.poses.append(item)
     return message
-
-
-def _matrix(position: tuple[float, float, float], quaternion: tuple[float, float, float, float]) -> Array:
-    matrix = np.eye(4)
-    matrix[:3, 3] = position
-    length = np.linalg.norm(quaternion)
-    usable = np.isfinite(length) and length > 1e-6
-    matrix[:3, :3] = Rotation.from_quat(quaternion).as_matrix() if usable else np.full((3, 3), np.nan)
-    return matrix

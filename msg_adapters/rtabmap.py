@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from msg_adapters.metric_closures import MetricClosure
 from msg_adapters.poses import transform_of
 from msg_adapters.stamp_ids import NodePair
+from pnv_core.rotations import local_covariance
 
 USER_CLOSURE = 4  # rtabmap::Link::kUserClosure
 
@@ -28,7 +29,7 @@ def fill_link(link: Any, pair: NodePair, metric: MetricClosure, m_per_s: float) 
     covariance[:3, :3] += np.eye(3) * float((moved**2).sum())
     link.from_id, link.to_id, link.type = pair.match, pair.query, USER_CLOSURE
     link.transform = transform_of(metric.relative)
-    link.information = np.linalg.inv(covariance).ravel()
+    link.information = np.linalg.inv(local_covariance(covariance, metric.relative)).ravel()
     return link
 
 

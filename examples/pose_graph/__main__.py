@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
-from scipy.spatial.transform import Rotation
 
 from examples.pose_graph.back_end import BackEndNode, Recording, graph_of
 from examples.pose_graph.drift import drifted
@@ -30,6 +29,7 @@ from pnv_core.errors import PnvError
 from pnv_core.pose.geometry import Intrinsics
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.rotations import quaternion_of
 
 _LATE_S, _LATEST_S = 4.0, 20.0  # the node may still work on the last frames
 _SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -87,10 +87,8 @@ def recorded(walk: Walk, odometry: Array) -> Recording:
             if closure.accepted:
                 recording.closures.append(replace(closure, matches=()))
                 pose = relative.estimate(closure)
-                if pose is not None and pose.covariance is not None:
-                    camera = np.eye(4)
-                    camera[:3, :3], camera[:3, 3] = pose.rotation, pose.translation
-                    recording.measured[closure.query.stamp_ns, closure.match.id] = camera, pose.covariance
+                if pose is not None and pose.metric:
+                    recording.measured[closure.query.stamp_ns, closure.match.id] = pose.matrix, pose.covariance
     return recording
 
 
@@ -137,7 +135,7 @@ def _write_odometry(path: Path, stamps_ns: list[int], poses: Array) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["stamp_ns", "x", "y", "z", "qx", "qy", "qz", "qw"])
-        quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+        quaternions = quaternion_of(poses[:, :3, :3])
         for stamp, pose, quaternion in zip(stamps_ns, poses, quaternions, strict=True):
             writer.writerow([stamp, *np.round(pose[:3, 3], 6), *np.round(quaternion, 9)])
 

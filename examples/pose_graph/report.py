@@ -9,11 +9,11 @@ import numpy as np
 from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from examples.pose_graph.back_end import Recording, RecordingBackEnd, graph_of
 from examples.pose_graph.drift import drifted
 from examples.pose_graph.sequences import Walk
+from pnv_core.rotations import quaternion_of
 from pnv_core.types import ImageRef, LoopClosure
 
 Array = NDArray[np.float64]
@@ -146,7 +146,7 @@ def write_tables(results: Sequence[Result], folder: Path) -> None:
     for r in results:
         _write_closures(r, folder / f"slam_{r.walk.name.replace(' ', '_')}_closures.csv")
         for kind, poses in (("truth", r.walk.truth), ("odometry", r.odometry), ("corrected", r.corrected)):
-            quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat()
+            quaternions = quaternion_of(poses[:, :3, :3])
             seconds = np.array(r.walk.stamps_ns)[:, None] / 1e9
             table = np.hstack([seconds, poses[:, :3, 3], quaternions])
             np.savetxt(folder / f"slam_{r.walk.name.replace(' ', '_')}_{kind}.tum", table, fmt="%.9f")

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
+from pnv_core.rotations import matrix_of
 from pnv_core.types import ImageRef
 
 NOISE_M = 0.2  # less is no way gone: forty times the tremble of 5 mm that wheel and visual odometry show at rest
@@ -44,14 +45,8 @@ class Position:
 
     def of(self, offset: Sequence[float]) -> tuple[float, float, float]:
         """Where a point fixed to the robot is, such as a camera at `offset` (x, y, z) in the robot's own frame."""
-        x, y, z, w = self.quaternion
-        a, b, c = offset
-        turned = (
-            (1 - 2 * (y * y + z * z)) * a + 2 * (x * y - z * w) * b + 2 * (x * z + y * w) * c,
-            2 * (x * y + z * w) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z - x * w) * c,
-            2 * (x * z - y * w) * a + 2 * (y * z + x * w) * b + (1 - 2 * (x * x + y * y)) * c,
-        )
-        return self.xyz[0] + turned[0], self.xyz[1] + turned[1], self.xyz[2] + turned[2]
+        x, y, z = matrix_of(self.quaternion) @ offset
+        return self.xyz[0] + x, self.xyz[1] + y, self.xyz[2] + z
 
 
 Sample = tuple[int, tuple[float, float, float], tuple[float, float, float, float]]  # stamp, position, quaternion

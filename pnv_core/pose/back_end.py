@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.pose.graph import Loop, PoseGraph
+from pnv_core.rotations import OPTICAL_IN_BODY, angle_of, exponential, inverse, logarithm, rigid, transported
 from pnv_core.types import LoopClosure
 
 Array = NDArray[np.float64]
 
-OPTICAL_IN_BODY = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 _S = 1_000_000_000
 _MOST_WAITING = 1000
 _SAMPLE_NS = 20_000_000  # odometry is kept at 50 Hz: an hour is 180,000 poses, 25 MB
@@ -127,7 +127,7 @@ class BackEnd:
         moved = self.graph.update(settle=everything)
         if self.stamps:
             newest = len(self.graph) - 1
-            self._correction = self.graph.newest @ np.linalg.inv(self.graph.odometry(newest))
+            self._correction = self.graph.newest @ inverse(self.graph.odometry(newest))
         return moved
 
     @property
@@ -141,8 +141,8 @@ class BackEnd:
         return len(self._waiting)
 
     def _far(self, pose: Array) -> bool:
-        step = np.linalg.inv(self.graph.odometry(len(self.graph) - 1)) @ pose
-        turned = math.acos(min(1.0, max(-1.0, (np.trace(step[:3, :3]) - 1) / 2)))
+        step = inverse(self.graph.odometry(len(self.graph) - 1)) @ pose
+        turned = float(angle_of(step[:3, :3]))
         return bool(np.linalg.norm(step[:3, 3]) >= self._keep.node_m) or turned >= math.radians(self._keep.node_deg)
 
     def _add_node(self, stamp_ns: int, pose: Array, continues: bool = True) -> None:
@@ -184,14 +184,13 @@ class BackEnd:
 
     def _loop(self, closure: LoopClosure, query: tuple[int, Array], match: tuple[int, Array]) -> Loop:
         measured = self._measured.pop((closure.query.stamp_ns, closure.match.id), None)
-        bodies, covariance = np.eye(4), None
-        if measured is not None:
-            camera, covariance = measured
-            bodies = self._mount @ camera @ np.linalg.inv(self._mount)
-            turn = np.kron(np.eye(2), self._mount[:3, :3])
-            covariance = turn @ covariance @ turn.T
-        relative = match[1] @ bodies @ np.linalg.inv(query[1])
-        return Loop(query[0], match[0], closure.score, relative, covariance)
+        before, after = match[1], inverse(query[1])
+        if measured is None:
+            return Loop(query[0], match[0], closure.score, before @ after)
+        camera, covariance = measured
+        before, after = before @ self._mount, inverse(self._mount) @ after
+        covariance = transported(covariance, camera, before, after)
+        return Loop(query[0], match[0], closure.score, before @ camera @ after, covariance)
 
     def _at(self, stamp_ns: int) -> tuple[int, Array] | None:
         """The last node at or before a stamp, and the body at the stamp as seen from it; None without odometry."""
@@ -211,7 +210,7 @@ class BackEnd:
         node = bisect_right(self.stamps, stamp_ns, lo=self._first) - 1
         if node < self._first:
             return None
-        return node, np.linalg.inv(self.graph.odometry(node)) @ _between(before, later, share)
+        return node, inverse(self.graph.odometry(node)) @ _between(before, later, share)
 
     def _drop(self, closure: LoopClosure, why: str) -> None:
         stamps = f"{_s(closure.query.stamp_ns)} - {_s(closure.match.stamp_ns)}"
@@ -224,13 +223,8 @@ class BackEnd:
 
 def _between(a: Array, b: Array, share: float) -> Array:
     """The pose a `share` of the way from a to b."""
-    import cv2
-
-    step = np.linalg.inv(a) @ b
-    part = np.eye(4)
-    part[:3, :3] = cv2.Rodrigues(cv2.Rodrigues(step[:3, :3])[0] * share)[0]
-    part[:3, 3] = step[:3, 3] * share
-    return a @ part
+    step = inverse(a) @ b
+    return a @ rigid(exponential(logarithm(step[:3, :3]) * share), step[:3, 3] * share)
 
 
 def _s(stamp_ns: int) -> str:

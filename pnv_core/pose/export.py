@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pnv_core.errors import PnvError
 from pnv_core.pose.geometry import RelativePose
+from pnv_core.rotations import local_covariance, matrix_of, quaternion_of
 from pnv_core.types import LoopClosure
 
 Array = NDArray[np.float64]
@@ -82,17 +83,17 @@ def graph_to_g2o(
     order = sorted(nodes)
     information = np.diag([odometry_sigma[0] ** -2] * 3 + [odometry_sigma[1] ** -2] * 3)
     for a, b in itertools.pairwise(order):
-        rotation = _matrix(nodes[a].quaternion)
+        rotation = matrix_of(nodes[a].quaternion)
         position = rotation.T @ (np.asarray(nodes[b].position) - nodes[a].position)
-        lines.append(_edge(a, b, position, _quaternion(rotation.T @ _matrix(nodes[b].quaternion)), information))
+        lines.append(_edge(a, b, position, quaternion_of(rotation.T @ matrix_of(nodes[b].quaternion)), information))
     for closure, pose in closures:
         a, b = closure.match.id, closure.query.id
         if a not in nodes or b not in nodes:
             continue
-        if pose is None or not pose.metric or pose.covariance is None:
+        if pose is None or not pose.metric:
             lines.append(f"# closure {a} {b} score {closure.score:.6f} without scale")
         else:
-            information = np.linalg.inv(pose.covariance).astype(np.float64)
+            information = np.linalg.inv(local_covariance(pose.covariance, pose.matrix)).astype(np.float64)
             lines.append(_edge(a, b, pose.translation, pose.quaternion, information))
     return "\n".join(lines) + "\n"
 
@@ -100,9 +101,9 @@ def graph_to_g2o(
 def pose_graph_to_g2o(poses: Array, edges: Sequence[tuple[int, int, Array, Array]]) -> str:
     """Poses (n, 4, 4) by number, and edges (from, to, relative (4, 4), information (6, 6) with position first)."""
     lines = [
-        f"VERTEX_SE3:QUAT {i} {_numbers(p[:3, 3])} {_numbers(_quaternion(p[:3, :3]))}" for i, p in enumerate(poses)
+        f"VERTEX_SE3:QUAT {i} {_numbers(p[:3, 3])} {_numbers(quaternion_of(p[:3, :3]))}" for i, p in enumerate(poses)
     ]
-    lines += [_edge(a, b, step[:3, 3], _quaternion(step[:3, :3]), information) for a, b, step, information in edges]
+    lines += [_edge(a, b, step[:3, 3], quaternion_of(step[:3, :3]), information) for a, b, step, information in edges]
     return "".join(line + "\n" for line in lines)
 
 
@@ -115,18 +116,3 @@ def _edge(a: int, b: int, position: Array, quaternion: Array, information: Array
 
 def _numbers(values: Sequence[float] | Array) -> str:
     return " ".join(f"{float(v) + 0.0:.9g}" for v in values)  # + 0.0: no negative zeros
-
-
-def _matrix(q: Array) -> Array:
-    x, y, z, w = np.asarray(q, np.float64) / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _quaternion(rotation: Array) -> Array:
-    return RelativePose(rotation, np.zeros(3), metric=False, inliers=0).quaternion

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.errors import PnvError
+from pnv_core.rotations import angle_of, local_covariance
 
 Array = NDArray[np.float64]
 
@@ -45,7 +46,8 @@ class Noise:
 class Loop:
     """Two nodes of one place. `score` is P(same place), `relative` (4, 4) the query's pose as seen from the match.
 
-    `covariance` (6, 6) is of `relative` where it was measured, in the order x, y, z, rotations about x, y, z.
+    `covariance` (6, 6) is of `relative` where it was measured, in the order x, y, z, rotations about x, y, z, in the
+    match's frame, as ROS has it.
     """
 
     query: int
@@ -215,7 +217,7 @@ class PoseGraph:
         turned = math.radians(noise.odometry_deg_per_root_m) * math.sqrt(gone_m) + math.hypot(rad_one, rad_other)
         arm = max(np.linalg.norm(between_matches[:3, 3]), np.linalg.norm(between_queries[:3, 3]))
         metres = math.hypot(m_one, m_other) + noise.odometry_per_m * gone_m + turned * arm
-        angle = math.acos(min(1.0, max(-1.0, (np.trace(cycle[:3, :3]) - 1) / 2)))
+        angle = float(angle_of(cycle[:3, :3]))
         return bool(np.linalg.norm(cycle[:3, 3]) <= 3 * metres and angle <= 3 * turned)
 
     def _deviations(self, loop: Loop) -> tuple[float, float]:
@@ -227,7 +229,7 @@ class PoseGraph:
     def _odometry_noise(self, step: Array) -> Any:
         noise = self.noise
         metres = float(np.linalg.norm(step[:3, 3]))
-        turned = np.degrees(np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1)))
+        turned = np.degrees(angle_of(step[:3, :3]))
         yaw = np.deg2rad(0.1 + noise.odometry_deg_per_root_m * metres**0.5 + noise.odometry_deg_per_deg * turned)
         way = 0.002 + noise.odometry_per_m * metres
         tilt = 0.1 * yaw  # gravity is known to any robot with an accelerometer
@@ -242,7 +244,8 @@ class PoseGraph:
         )
         if loop.covariance is not None:
             order = [3, 4, 5, 0, 1, 2]  # GTSAM puts rotation first
-            return self._gtsam.noiseModel.Gaussian.Covariance(loop.covariance[np.ix_(order, order)] * crowd)
+            covariance = local_covariance(loop.covariance, loop.relative)
+            return self._gtsam.noiseModel.Gaussian.Covariance(covariance[np.ix_(order, order)] * crowd)
         scale = math.sqrt(crowd / max(loop.score, 0.05))
         return _sigmas(self._gtsam, math.radians(self.noise.tolerance_deg) * scale, self.noise.tolerance_m * scale)
 

@@ -4,11 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from pnv_core.errors import ConfigError
-from pnv_core.pose.back_end import OPTICAL_IN_BODY
 from pnv_core.pose.graph import KERNELS
+from pnv_core.rotations import mount_of
 from pnv_core.settings import checked, setting
 
 _MOUNT = "camera on the body: x, y, z, roll, pitch, yaw of its housing, which looks along x"
@@ -32,10 +31,7 @@ class BridgeConfig:
     @property
     def mount(self) -> NDArray[np.float64]:
         """The camera's optical frame in the body, (4, 4)."""
-        housing = np.eye(4)
-        housing[:3, :3] = Rotation.from_euler("xyz", self.camera_in_body[3:]).as_matrix()
-        housing[:3, 3] = self.camera_in_body[:3]
-        return housing @ OPTICAL_IN_BODY
+        return mount_of(self.camera_in_body)
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ import pytest
 pytest.importorskip("gtsam", reason="the back end needs GTSAM")
 
 from pnv_core.errors import PnvError
-from pnv_core.pose.back_end import OPTICAL_IN_BODY, BackEnd
+from pnv_core.pose.back_end import BackEnd
 from pnv_core.pose.export import pose_graph_to_g2o
 from pnv_core.pose.graph import Noise, PoseGraph
+from pnv_core.rotations import OPTICAL_IN_BODY
 from pnv_core.types import ImageRef, LoopClosure
 
 S = 1_000_000_000

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from pnv_core.rotations import matrix_of, quaternion_of, rigid
 from pnv_lab.evaluation.datasets.dataset import NONE, Indices
 
 Floats = NDArray[np.float64]
@@ -45,33 +46,20 @@ def pose_errors(estimated: Floats, true: Floats) -> tuple[Floats, Floats]:
 
 def rotation(w: float, x: float, y: float, z: float) -> Floats:
     """(3, 3) of a quaternion. Raises ValueError for a zero one."""
-    q = np.array([w, x, y, z], np.float64)
-    norm = np.linalg.norm(q)
-    if not norm > 0:
+    if not np.linalg.norm((w, x, y, z)) > 0:
         raise ValueError("quaternion of length 0")
-    w, x, y, z = q / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return matrix_of((x, y, z, w))
 
 
 def quaternion(matrix: Floats) -> tuple[float, float, float, float]:
     """(w, x, y, z), w >= 0, of a (3, 3) rotation."""
-    from scipy.spatial.transform import Rotation
-
-    x, y, z, w = Rotation.from_matrix(matrix).as_quat(canonical=True)
+    x, y, z, w = quaternion_of(matrix)
     return float(w), float(x), float(y), float(z)
 
 
 def pose(rotation_matrix: Floats, position: Sequence[float] | Floats) -> Floats:
     """(4, 4) from (3, 3) and (3,)."""
-    out = np.eye(4)
-    out[:3, :3], out[:3, 3] = rotation_matrix, position
-    return out
+    return rigid(rotation_matrix, position)
 
 
 def pose_from_world_rotation(quaternion_wxyz: Sequence[float], centre: Sequence[float]) -> Floats:
