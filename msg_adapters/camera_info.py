@@ -1,6 +1,6 @@
 """sensor_msgs/CameraInfo to a rectification of images."""
 
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 
 from msg_adapters.images import check_size
 from pnv_core.errors import ImageError
+
+T = TypeVar("T", np.uint8, np.float32)
 
 PINHOLE = ("plumb_bob", "rational_polynomial")
 FISHEYE = ("equidistant", "fisheye")
@@ -23,6 +25,12 @@ def calibration_of(info: Any) -> tuple[Any, ...]:
     """What a CameraInfo says of the camera, comparable."""
     numbers = (np.asarray(v, np.float64).tobytes() for v in (info.k, info.d, info.p))
     return int(info.width), int(info.height), info.distortion_model, *numbers
+
+
+def baseline_of(info: Any) -> float:
+    """How far right of the left camera of a stereo pair this one is, metres: -P[3] / P[0]; 0 for other cameras."""
+    p = [float(v) for v in info.p]
+    return -p[3] / p[0] if p[0] > 0 and np.isfinite(p[3]) else 0.0
 
 
 class Rectifier:
@@ -73,11 +81,15 @@ class Rectifier:
                 raise ImageError(f"camera info with d = {d.tolist()} leaves {seen:.0%} of the image; "
                                  f"allowed: a distortion that leaves {LEAST_SEEN:.0%}")  # fmt: skip
 
-    def __call__(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W) or (H, W, 3) -> the same shape, 0 where nothing was seen. Raises ImageError for another size."""
+    def __call__(self, pixels: NDArray[T]) -> NDArray[T]:
+        """(H, W) or (H, W, 3) -> the same shape, 0 where nothing was seen. Raises ImageError for another size.
+
+        Depth (float32) is that of the nearest pixel, uninterpolated.
+        """
         if (pixels.shape[1], pixels.shape[0]) != self.size:
             raise ImageError(f"image is {pixels.shape[1]}x{pixels.shape[0]}; allowed by its camera info: "
                              f"{self.size[0]}x{self.size[1]}")  # fmt: skip
         if self._maps is None:
             return pixels
-        return cv2.remap(pixels, *self._maps, cv2.INTER_LINEAR)
+        how = cv2.INTER_LINEAR if pixels.dtype == np.uint8 else cv2.INTER_NEAREST  # no depth lies between two surfaces
+        return cv2.remap(pixels, *self._maps, how)

@@ -18,7 +18,7 @@ def relative_pose_to_message(closure: LoopClosure, pose: RelativePose) -> PoseWi
 
     Raises PnvError for a pose without scale: a message has no way to say so.
     """
-    if not pose.metric or pose.covariance is None:
+    if not pose.metric:
         raise PnvError("relative pose without scale; allowed: a metric one, from depth or odometry")
     message = PoseWithCovarianceStamped()
     message.header.stamp = to_time(closure.query.stamp_ns)

@@ -102,7 +102,7 @@ def _ref_from_message(message: Any) -> ImageRef:
 def _kind(pose: RelativePose) -> int:
     from pnv_msgs.msg import LoopClosure as Typed
 
-    return Typed.METRIC if pose.metric and pose.covariance is not None else Typed.DIRECTION
+    return Typed.METRIC if pose.metric else Typed.DIRECTION
 
 
 def _pose_to_message(pose: RelativePose) -> PoseWithCovariance:
@@ -110,6 +110,5 @@ def _pose_to_message(pose: RelativePose) -> PoseWithCovariance:
     position, orientation = message.pose.position, message.pose.orientation
     position.x, position.y, position.z = (float(v) for v in pose.translation)
     orientation.x, orientation.y, orientation.z, orientation.w = (float(v) for v in pose.quaternion)
-    if pose.metric and pose.covariance is not None:
-        message.covariance = [float(v) for v in pose.covariance.ravel()]
+    message.covariance = [float(v) for v in pose.covariance.ravel()]
     return message

@@ -1,5 +1,6 @@
 """PlaceRecognizer: one frame in, its loop-closure candidates out. Deterministic, no clock, no ROS."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -41,6 +42,8 @@ class PlaceRecognizer:
         self.judge = Judge(describer.config, describer.model.info.calibration, self.database.steps)
         self.sequence = SequenceMemory(self.database.steps)
         self.latest: Query | None = None  # of the last frame processed; None where it was no keyframe
+        # what a driver that knows cameras keeps of a frame for poses, beside what the verifier kept
+        self.geometry_of: Callable[[Frame, bytes], bytes] = lambda frame, kept: b""
         self.odometry = Odometry()  # a driver that has odometry calls odometry.add before the frames of that time
 
     @property
@@ -66,7 +69,7 @@ class PlaceRecognizer:
         self.keyframes.take(frame, descriptor)
         if self.config.verify:
             kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
-            descriptor = replace(descriptor, thumbnail=kept)
+            descriptor = replace(descriptor, thumbnail=kept, geometry=self.geometry_of(frame, kept))
         with self.timer.stage("retrieve"):
             recent_ns = int(self.config.exclude_recent_s * 1e9)
             candidates = self.database.nearest(

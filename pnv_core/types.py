@@ -17,6 +17,8 @@ from pnv_core.errors import PnvError
 class Frame:
     """One camera image. `stamp_ns` is the image's own stamp (never the wall clock), `rgb` is (H, W, 3) uint8.
 
+    `depth` (H, W) is in metres along the optical axis, aligned to the image; 0 or NaN where unknown.
+
     Raises PnvError for a stamp that is no whole number of nanoseconds: seconds in a float would all be one moment.
     """
 
@@ -24,6 +26,7 @@ class Frame:
     camera: str
     rgb: NDArray[np.uint8]
     valid: NDArray[np.bool_] | None = None  # (H, W), False where the robot sees itself; None = all valid
+    depth: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         whole = isinstance(self.stamp_ns, int | np.integer) and not isinstance(self.stamp_ns, bool)
@@ -83,6 +86,7 @@ class PlaceDescriptor:
     patches: tuple[PatchGrid, ...]
     texture: float = 1.0
     thumbnail: bytes = b""
+    geometry: bytes = b""  # what a driver that knows the camera keeps for poses
 
 
 @dataclass(frozen=True)

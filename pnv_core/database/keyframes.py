@@ -2,6 +2,7 @@
 
 import copy
 import logging
+import struct
 import threading
 import time
 from bisect import bisect_left
@@ -37,6 +38,7 @@ MB = 1_000_000
 _COUNTS = ("read_only", "_evicted", "_unreadable")  # of a database that goes on when its contents are replaced
 # Python objects of one keyframe (record, reference, row, buffer header, places in dicts and in the eviction policy)
 OBJECT_BYTES = 2000
+_GEOMETRY_END, _GEOMETRY_MARK = struct.Struct("<I8s"), b"PNVGend\x00"
 
 _log = logging.getLogger(__name__)
 
@@ -51,7 +53,7 @@ class StoredKeyframe:
     vector: NDArray[np.float32]  # (D,), a row of the vector table, valid while `row` lives
     row: Row
     layouts: tuple[GridLayout, ...]
-    buffer: NDArray[np.uint8] | DiskBuffer  # the patches, then the thumbnail
+    buffer: NDArray[np.uint8] | DiskBuffer  # the patches, the thumbnail, what is known for poses
     texture: float
 
     def read(self) -> NDArray[np.uint8]:
@@ -65,8 +67,7 @@ class StoredKeyframe:
         """`cell` is the trunk's stride, the same for every keyframe of a model."""
         buffer = self.read()
         patches = tuple(codes.grid(cell) for codes in views(buffer, self.layouts))
-        thumbnail = buffer[buffer_bytes(self.layouts) :].tobytes()
-        return PlaceDescriptor(self.vector.copy(), patches, self.texture, thumbnail)
+        return PlaceDescriptor(self.vector.copy(), patches, self.texture, *_parted(buffer, self.layouts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -230,7 +231,7 @@ class KeyframeDatabase:
     def bytes_per_keyframe(self, descriptor: PlaceDescriptor) -> int:
         """Bytes this keyframe would take, known before it is added."""
         patches = buffer_bytes(layout_of(descriptor.patches, self.patch_precision))
-        return self._table.row_bytes + OBJECT_BYTES + patches + len(descriptor.thumbnail)
+        return self._table.row_bytes + OBJECT_BYTES + patches + len(_joined(descriptor))
 
     def stats(self) -> DatabaseStats:
         with self._lock:
@@ -255,8 +256,8 @@ class KeyframeDatabase:
         vector = _unit_vector(descriptor.global_vector, self.dim)
         layouts = self._shared(layout_of(descriptor.patches, self.patch_precision))
         buffer = encode(descriptor.patches, layouts)
-        if descriptor.thumbnail:
-            buffer = np.concatenate([buffer, np.frombuffer(descriptor.thumbnail, np.uint8)])
+        if rest := _joined(descriptor):
+            buffer = np.concatenate([buffer, np.frombuffer(rest, np.uint8)])
             buffer.flags.writeable = False
         with self._lock:
             self._make_room(len(buffer))
@@ -382,11 +383,18 @@ class KeyframeDatabase:
 
     def picture(self, keyframe: int) -> bytes:
         """The small picture of a keyframe; empty where none is kept, or the keyframe is gone or unreadable."""
+        return self._rest(keyframe)[0]
+
+    def geometry(self, keyframe: int) -> bytes:
+        """What is kept of a keyframe for poses; empty where nothing is, or the keyframe is gone or unreadable."""
+        return self._rest(keyframe)[1]
+
+    def _rest(self, keyframe: int) -> tuple[bytes, bytes]:
         stored = self._keyframes.get(keyframe)
         try:
-            return b"" if stored is None else stored.read()[buffer_bytes(stored.layouts) :].tobytes()
+            return (b"", b"") if stored is None else _parted(stored.read(), stored.layouts)
         except OSError:
-            return b""
+            return b"", b""
 
     def patches(self, keyframe: int) -> tuple[PatchCodes, ...]:
         """The patches of a keyframe exactly as stored, one PatchCodes per patch size (int8 with its scales)."""
@@ -495,6 +503,27 @@ class KeyframeDatabase:
                     f"{self.bytes_budget / MB:g}; allowed: a larger budget, patch_store = disk, or a pruned map"
                 )
         self._insert(kf.ref, kf.vector, self._shared(kf.layouts), buffer, kf.texture)
+
+
+def _joined(descriptor: PlaceDescriptor) -> bytes:
+    """What stands behind the patches: the thumbnail, and for poses whatever is known, its length and a mark.
+
+    Without a thumbnail nothing does: no pose is found without matches.
+    """
+    if not descriptor.thumbnail or not descriptor.geometry:
+        return descriptor.thumbnail
+    return descriptor.thumbnail + descriptor.geometry + _GEOMETRY_END.pack(len(descriptor.geometry), _GEOMETRY_MARK)
+
+
+def _parted(buffer: NDArray[np.uint8], layouts: tuple[GridLayout, ...]) -> tuple[bytes, bytes]:
+    """Thumbnail and geometry of a keyframe's buffer."""
+    rest = buffer[buffer_bytes(layouts) :].tobytes()
+    if len(rest) >= _GEOMETRY_END.size:
+        length, mark = _GEOMETRY_END.unpack_from(rest, len(rest) - _GEOMETRY_END.size)
+        start = len(rest) - _GEOMETRY_END.size - length
+        if mark == _GEOMETRY_MARK and start > 0:
+            return rest[:start], rest[start : start + length]
+    return rest, b""
 
 
 def _let_go(keyframes: dict[int, StoredKeyframe]) -> None:

@@ -106,6 +106,19 @@ def pyramid(texture: Image) -> list[Image]:
 
 def rasterise(surfaces: list[Surface], pyramids: list[list[Image]], camera: Camera, pose: Pose) -> Image:
     """The scene as the camera sees it, (H, W, 3). `pyramids` holds the lit texture levels of every surface."""
+    return _rasterised(surfaces, pyramids, camera, pose)[0]
+
+
+def depth_image(surfaces: list[Surface], camera: Camera, pose: Pose) -> NDArray[np.float32]:
+    """(H, W) metres along the optical axis; 0 where there is nothing or the sky."""
+    solid = [s for s in surfaces if not s.sky]
+    nearness = _rasterised(solid, [[s.texture] for s in solid], camera, pose)[1]
+    return np.divide(1, nearness, out=np.zeros_like(nearness), where=nearness > 0)
+
+
+def _rasterised(
+    surfaces: list[Surface], pyramids: list[list[Image]], camera: Camera, pose: Pose
+) -> tuple[Image, NDArray[np.float32]]:
     body = pose.matrix()
     eye = body[:3, 3]
     world_to_camera = (body[:3, :3] @ CAMERA_IN_BODY).T
@@ -133,7 +146,7 @@ def rasterise(surfaces: list[Surface], pyramids: list[list[Image]], camera: Came
         plane = project @ np.stack([rights[i], downs[i], origins[i]], axis=1)  # (fraction right, down, 1) -> pixel
         for square in _pieces(plane, _UNIT_SQUARE, 0):
             _draw(image, nearness, plane, square, pyramids[i])
-    return image
+    return image, nearness
 
 
 def _pieces(plane: Array, square: Array, level: int) -> list[Array]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pnv_core.errors import ConfigError
 from pnv_core.types import Frame
 from pnv_lab.worlds.light import Light, exposed, lit_texture
-from pnv_lab.worlds.rendering import Camera, Pose, pyramid, rasterise, wrapped
+from pnv_lab.worlds.rendering import Camera, Pose, depth_image, pyramid, rasterise, wrapped
 from pnv_lab.worlds.scenes import KINDS, Scene
 
 Array = NDArray[np.float64]
@@ -44,6 +44,10 @@ class World:
         light = light or Light()
         image = rasterise(self._scene.surfaces, self._lit_pyramids(light), Camera(*size), pose)
         return exposed(image, light, default_rng((light.seed, noise_seed)))
+
+    def depth(self, pose: Pose, size: tuple[int, int] = (320, 240)) -> NDArray[np.float32]:
+        """(height, width) metres along the optical axis of what `render` shows; 0 for the sky."""
+        return depth_image(self._scene.surfaces, Camera(*size), pose)
 
     def _lit_pyramids(self, light: Light) -> list[list[NDArray[np.uint8]]]:
         if self._lit is None or self._lit[0] != light:

@@ -12,7 +12,7 @@ from pnv_core.types import Evidence, ImageRef, LoopClosure
 
 TURN = cv2.Rodrigues(np.array([0.1, -0.4, 0.2]))[0]
 METRIC = RelativePose(TURN, np.array([1.0, 2.0, 3.0]), True, 40, np.diag([0.1, 0.2, 0.3, 0.01, 0.02, 0.03]))
-DIRECTION = RelativePose(TURN, np.array([1.0, 0.0, 0.0]), False, 40)
+DIRECTION = RelativePose(TURN, np.array([1.0, 0.0, 0.0]), False, 40, np.eye(6))
 CLOSURE = LoopClosure(
     ImageRef(3, 100_000_000_007, "front"), ImageRef(0, 5, "front"), 0.9, 0.5, 0.25, 60, True,
     evidence=Evidence(0.5, 0.25, 60, spread=0.4, local_inliers=31),

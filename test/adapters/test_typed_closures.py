@@ -45,14 +45,14 @@ def test_a_relative_pose_says_whether_it_is_metric(sent):
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     covariance = np.arange(36.0).reshape(6, 6)
     metric = RelativePose(turn, np.array([1.0, 2.0, 3.0]), True, 20, covariance)
-    direction = RelativePose(turn, np.array([0.0, 0.0, 1.0]), False, 20)
+    direction = RelativePose(turn, np.array([0.0, 0.0, 1.0]), False, 20, 2 * covariance)
     one, other, none = sent(closures_to_typed([*closures(), closures()[0]], {0: metric, 1: direction})).closures
     assert (one.pose_kind, other.pose_kind, none.pose_kind) == (one.METRIC, one.DIRECTION, one.NO_POSE)
     assert one.pose.covariance.tolist() == covariance.ravel().tolist()
     assert (one.pose.pose.position.x, one.pose.pose.position.y, one.pose.pose.position.z) == (1.0, 2.0, 3.0)
     quaternion = one.pose.pose.orientation
     assert (quaternion.z, quaternion.w) == pytest.approx((0.5**0.5, 0.5**0.5))
-    assert not any(other.pose.covariance)
+    assert other.pose.covariance.tolist() == (2 * covariance).ravel().tolist()
 
 
 def test_the_node_and_its_adapters_import_without_pnv_msgs():

@@ -1,19 +1,14 @@
 """Relative poses against scenes whose points and cameras are known."""
 
-import cv2
 import numpy as np
 import pytest
 
 from pnv_core.errors import ConfigError
-from pnv_core.pose.geometry import (
-    Intrinsics,
-    metric_from_baseline,
-    metric_from_depth,
-    relative_direction,
-)
+from pnv_core.pose.geometry import Intrinsics, depth_at, relative_pose, triangulated
+from pnv_core.rotations import exponential, logarithm, rigid
 from pnv_core.verify.verifier import EpipolarCheck
 
-CAMERA = Intrinsics.of_pixels(500.0, 500.0, 320.0, 240.0, 640)
+CAMERA = Intrinsics.of_pixels(500.0, 500.0, 319.5, 239.5, 640)
 NOISE = 0.2 / 320  # a fifth of a thumbnail pixel, in image widths
 
 
@@ -34,98 +29,132 @@ def check_of(a, b):
 
 
 def angle(r, s):
-    return np.degrees(np.linalg.norm(cv2.Rodrigues(r @ s.T)[0]))
+    return np.degrees(np.linalg.norm(logarithm(r @ s.T)))
 
 
-TURN = cv2.Rodrigues(np.array([0.03, 0.12, -0.02]))[0]
+def noisy(seed, n=150, outliers=0.0, turn=None, shift=None):
+    """A check of a scene, and the true depths of its points in query and match."""
+    rng = np.random.default_rng(seed)
+    points = scene(rng, n)
+    turn, shift = TURN if turn is None else turn, SHIFT if shift is None else shift
+    a, b = seen(points, rng=rng), seen(points, turn, shift, rng)
+    wrong = int(outliers * n)
+    b[:wrong] = rng.uniform(0, 0.75, (wrong, 2))
+    return check_of(a, b), points[:, 2], (points @ turn.T + shift)[:, 2]
+
+
+TURN = exponential(np.array([0.03, 0.12, -0.02]))
 SHIFT = np.array([0.5, -0.1, 0.8])
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rotation_and_direction_are_those_of_the_scene(seed):
-    rng = np.random.default_rng(seed)
-    points = scene(rng)
-    pose = relative_direction(check_of(seen(points, rng=rng), seen(points, TURN, SHIFT, rng)), CAMERA, CAMERA)
+    pose = relative_pose(noisy(seed, outliers=0.2)[0], CAMERA, CAMERA)
     assert not pose.metric
-    assert pose.covariance is None
     assert angle(pose.rotation, TURN) < 0.3
-    cosine = pose.translation @ SHIFT / np.linalg.norm(SHIFT)
     assert np.linalg.norm(pose.translation) == pytest.approx(1.0)
-    assert cosine > np.cos(np.radians(3))
+    assert pose.translation @ SHIFT / np.linalg.norm(SHIFT) > np.cos(np.radians(3))
+    assert pose.translation @ pose.covariance[:3, :3] @ pose.translation == pytest.approx(0, abs=1e-12)
 
 
 def test_turning_on_the_spot_gives_the_rotation_and_no_direction():
-    rng = np.random.default_rng(1)
-    points = scene(rng)
-    pose = relative_direction(check_of(seen(points, rng=rng), seen(points, TURN, rng=rng)), CAMERA, CAMERA)
+    pose = relative_pose(noisy(1, shift=np.zeros(3))[0], CAMERA, CAMERA)
+    assert not pose.metric
     assert not pose.translation.any()
     assert angle(pose.rotation, TURN) < 0.3
 
 
+def test_a_turn_about_any_axis_is_told():
+    turn = exponential(np.array([0.0, 0.0, 2.9]))  # the camera nearly upside down
+    check, depth, _ = noisy(2, turn=turn)
+    for pose in (relative_pose(check, CAMERA, CAMERA), relative_pose(check, CAMERA, CAMERA, depth)):
+        assert angle(pose.rotation, turn) < 0.3
+
+
 def test_too_few_points_give_no_pose():
     points = scene(np.random.default_rng(0), 9)
-    assert relative_direction(check_of(seen(points), seen(points, TURN, SHIFT)), CAMERA, CAMERA) is None
+    assert relative_pose(check_of(seen(points), seen(points, TURN, SHIFT)), CAMERA, CAMERA) is None
     empty = np.empty((0, 2), np.float32)
-    assert relative_direction(check_of(empty, empty), CAMERA, CAMERA) is None
+    assert relative_pose(check_of(empty, empty), CAMERA, CAMERA) is None
 
 
-def depth_of(points, image):
-    depth = np.zeros((480, 640))
-    row, column = (image[:, ::-1] * 640).astype(int).T
-    inside = (row >= 0) & (row < 480) & (column >= 0) & (column < 640)
-    depth[row[inside], column[inside]] = points[inside, 2]
-    return depth
+@pytest.mark.parametrize("known", ["query", "match", "both", "a third"])
+def test_depth_makes_the_pose_metric_wherever_it_is_known(known):
+    check, here, there = noisy(3, outliers=0.2)
+    few = np.where(np.arange(len(here)) % 3 == 0, here, np.nan)
+    given = {"query": (here, None), "match": (None, there), "both": (here, there), "a third": (few, None)}[known]
+    pose = relative_pose(check, CAMERA, CAMERA, *given)
+    assert pose.metric
+    assert angle(pose.rotation, TURN) < 0.3
+    assert np.linalg.norm(pose.translation - SHIFT) < 0.05
 
 
-def test_depth_makes_the_pose_metric_and_its_covariance_tells_the_error():
-    errors, sigmas = [], []
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        points = scene(rng)
-        a, b = seen(points, rng=rng), seen(points, TURN, SHIFT, rng)
-        pose = metric_from_depth(check_of(a, b), depth_of(points, a), CAMERA, CAMERA)
-        assert pose.metric
-        assert angle(pose.rotation, TURN) < 0.5
-        assert np.linalg.norm(pose.translation - SHIFT) < 0.08
-        assert np.allclose(pose.covariance, pose.covariance.T)
-        assert (np.linalg.eigvalsh(pose.covariance) > 0).all()
-        errors.append(pose.translation - SHIFT)
-        sigmas.append(np.sqrt(np.diag(pose.covariance)[:3]))
-    share = np.mean(np.abs(errors) < 3 * np.array(sigmas))
-    assert share > 0.95
+@pytest.mark.parametrize("metric", [False, True])
+def test_the_covariance_tells_the_error(metric):
+    squared = []
+    for seed in range(40):
+        check, depth, _ = noisy(seed, 60 + 2 * seed)
+        pose = relative_pose(check, CAMERA, CAMERA, depth if metric else None)
+        true = SHIFT if metric else SHIFT / np.linalg.norm(SHIFT)
+        away = np.append(true - pose.translation, logarithm(TURN @ pose.rotation.T))
+        freedom = 6 if metric else 5
+        squared.append(away @ np.linalg.pinv(pose.covariance, rcond=1e-7, hermitian=True) @ away / freedom)
+    assert 0.3 < np.median(squared) < 1.3  # of chi squared over its freedom the median is 0.89
+    assert np.mean(np.array(squared) < 2.2) > 0.85  # its 95th percentile, both freedoms
+
+
+def test_depth_is_read_where_the_point_is_and_nowhere_else():
+    depth = np.zeros((480, 640), np.float32)
+    depth[100, 200], depth[100, 201], depth[0, 0] = 3.0, np.nan, 1e6
+    points = np.array([[200.5, 100.5], [201.5, 100.5], [0.5, 0.5], [300.5, 100.5]]) / 640
+    assert depth_at(depth, points)[0] == 3.0
+    assert np.isnan(depth_at(depth, points)[1:]).all()
 
 
 def test_without_any_depth_there_is_no_metric_pose():
-    points = scene(np.random.default_rng(0))
-    check = check_of(seen(points), seen(points, TURN, SHIFT))
-    assert metric_from_depth(check, np.zeros((480, 640)), CAMERA, CAMERA) is None
-    assert metric_from_depth(check, np.full((480, 640), np.nan), CAMERA, CAMERA) is None
+    check, depth, _ = noisy(0)
+    for nothing in (np.zeros_like(depth), np.full_like(depth, np.nan), np.full_like(depth, -1)):
+        assert not relative_pose(check, CAMERA, CAMERA, nothing).metric
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_baseline_from_odometry_sets_the_scale(seed):
+def test_a_known_motion_to_a_view_beside_sets_the_scale(seed):
     rng = np.random.default_rng(seed)
     points = scene(rng, 300)
-    step = np.array([0.35, 0.02, 0.2])
+    step = rigid(exponential(np.array([0, 0.02, 0])), [0.35, 0.02, 0.2])
     query = seen(points, rng=rng)
     check = check_of(query, seen(points, TURN, SHIFT, rng))
-    neighbour = check_of(query, seen(points, cv2.Rodrigues(np.array([0, 0.02, 0]))[0], step, rng))
-    pose = metric_from_baseline(check, neighbour, float(np.linalg.norm(step)), CAMERA, CAMERA)
+    beside = check_of(query, seen(points, step[:3, :3], step[:3, 3], rng))
+    depth = triangulated(beside, CAMERA, CAMERA, step)
+    known = np.isfinite(depth)
+    assert known.sum() > 100
+    assert np.median(np.abs(depth[known] / points[known, 2] - 1)) < 0.1
+    pose = relative_pose(check, CAMERA, CAMERA, depth)
     assert pose.metric
-    assert angle(pose.rotation, TURN) < 1
+    assert angle(pose.rotation, TURN) < 0.5
     error = np.linalg.norm(pose.translation - SHIFT)
     assert error < 0.15 * np.linalg.norm(SHIFT)
     assert error < 4 * np.sqrt(np.trace(pose.covariance[:3, :3]))
 
 
-def test_no_scale_is_invented_where_the_baseline_shows_no_parallax():
+def test_no_scale_is_invented_where_the_view_beside_shows_no_parallax():
     rng = np.random.default_rng(0)
     points = scene(rng)
     query = seen(points, rng=rng)
-    check = check_of(query, seen(points, TURN, SHIFT, rng))
     still = check_of(query, seen(points, rng=rng))
-    assert metric_from_baseline(check, still, 0.3, CAMERA, CAMERA) is None
-    assert metric_from_baseline(check, check, 0.0, CAMERA, CAMERA) is None
+    assert not np.isfinite(triangulated(still, CAMERA, CAMERA, rigid(np.eye(3), [0.3, 0, 0]))).any()
+    assert not np.isfinite(triangulated(still, CAMERA, CAMERA, np.eye(4))).any()
+
+
+def test_the_cameras_may_differ():
+    rng = np.random.default_rng(4)
+    points = scene(rng)
+    wide = Intrinsics.of_pixels(300.0, 320.0, 310.0, 250.0, 640)
+    moved = points @ TURN.T + SHIFT
+    b = moved[:, :2] / moved[:, 2:] * (wide.fx, wide.fy) + (wide.cx, wide.cy)
+    pose = relative_pose(check_of(seen(points), b.astype(np.float32)), CAMERA, wide, points[:, 2])
+    assert angle(pose.rotation, TURN) < 0.05
+    assert np.allclose(pose.translation, SHIFT, atol=0.01)
 
 
 def test_an_uncalibrated_camera_is_refused():
