@@ -187,7 +187,7 @@ def run(setup: Setup, args: argparse.Namespace, map_path: Path) -> dict[str, Any
     listener = Listener()
     closures = Latencies(listener)
     diagnostics = listener.collect(DiagnosticArray, "/diagnostics")
-    known = {"map_path": str(map_path), "load_on_start": True, "read_only": True}
+    known = {"map_path": str(map_path), "load_on_start": True, "localization": True}
     with node(setup, {}, **(known | args.parameters)) as process:
         process.wait_for("publishes")
         with camera(setup, args, args.seconds + 30):

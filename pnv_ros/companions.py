@@ -8,15 +8,16 @@ from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import qos_policy_name_from_kind, qos_profile_sensor_data
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, Image
 
-from msg_adapters.camera_info import Rectifier, calibration_of
+from msg_adapters.camera_info import Rectifier, baseline_of, calibration_of
 from msg_adapters.images import stamp_of
 from pnv_core.decide.odometry import Odometry as OdometryMemory
 from pnv_core.errors import PnvError
 from pnv_core.pose.relative_poses import RelativePoses
+from pnv_ros.depths import Depths
 from pnv_ros.inputs import qos_in_words
-from pnv_ros.markers import PoseTrack
+from pnv_ros.markers import Placing
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.view import View
 
@@ -33,20 +34,25 @@ class Companions:
 
     def __init__(
         self, node: Node, config: NodeConfig, views: dict[str, View], poses: RelativePoses, odometry: OdometryMemory,
-        track: PoseTrack,
+        placing: Placing,
     ) -> None:  # fmt: skip
-        self._node, self._views, self._poses, self._odometry, self._track = node, views, poses, odometry, track
+        self._node, self._views, self._poses, self._placing = node, views, poses, placing
         self._calibrations: dict[str, tuple[Any, ...]] = {}
         self._mismatches: dict[str, str] = {}  # topic: policy
         self._subscriptions: dict[str, Any] = {}
         self._info_topics = dict(zip(config.image_topics, config.camera_info_topics, strict=False))
         for camera, topic in self._info_topics.items():
             self._subscribe(CameraInfo, topic, self._calibrate(camera))
+        self.depths = Depths(node) if config.depth_topics else None
+        for camera, topic in zip(config.image_topics, config.depth_topics, strict=False):
+            if self.depths is not None:
+                self._subscribe(Image, topic, self.depths.receive(camera))
         if config.odometry_topic:
-            shown = None if config.pose_topic else track
-            self._subscribe(Odometry, config.odometry_topic, self._odometry_came(shown))
+            self._subscribe(Odometry, config.odometry_topic, self._came(odometry, "odometry"))
+            placing.track = odometry
         if config.pose_topic:
-            self._subscribe(PoseStamped, config.pose_topic, track.add)
+            placing.track = poses.track = OdometryMemory()
+            self._subscribe(PoseStamped, config.pose_topic, self._came(poses.track, "pose"))
 
     def close(self) -> None:
         for subscription in self._subscriptions.values():
@@ -78,17 +84,20 @@ class Companions:
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=mismatch),
         )  # fmt: skip
 
-    def _odometry_came(self, track: PoseTrack | None) -> Callable[[Odometry], None]:
-        def receive(message: Odometry) -> None:
-            p, q = message.pose.pose.position, message.pose.pose.orientation
-            refusal = self._odometry.add(stamp_of(message), p.x, p.y, p.z, (q.x, q.y, q.z, q.w))
+    def _came(self, memory: OdometryMemory, name: str) -> Callable[[Any], None]:
+        """The callback for Odometry or PoseStamped."""
+
+        def receive(message: Any) -> None:
+            pose = message.pose.pose if isinstance(message, Odometry) else message.pose
+            p, q = pose.position, pose.orientation
+            refusal = memory.add(stamp_of(message), p.x, p.y, p.z, (q.x, q.y, q.z, q.w))
+            if memory is self._placing.track:
+                self._placing.frame_id = message.header.frame_id
             if refusal is not None:
                 self._node.get_logger().warning(
-                    f"odometry at {p.x:.6g}, {p.y:.6g}, {p.z:.6g} m is not taken: {refusal} "
-                    f"({self._odometry.refused} so far)", throttle_duration_sec=_REPEAT_S,
+                    f"{name} at {p.x:.6g}, {p.y:.6g}, {p.z:.6g} m is not taken: {refusal} "
+                    f"({memory.refused} so far)", throttle_duration_sec=_REPEAT_S,
                 )  # fmt: skip
-            elif track is not None:
-                track.add(message)
 
         return receive
 
@@ -102,6 +111,7 @@ class Companions:
             try:
                 rectifier = Rectifier(info, rectified=is_rectified(camera))
                 self._poses.cameras[camera] = view.intrinsics(rectifier)
+                self._poses.baselines[camera] = baseline_of(info)
             except PnvError as error:
                 self._node.get_logger().warning(f"camera info of {camera}: {error}", throttle_duration_sec=_REPEAT_S)
                 return

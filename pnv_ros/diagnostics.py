@@ -57,6 +57,7 @@ class Diagnostics:
 
         losses = self._losses(settings.node.image_topics, inputs)
         fleet = self._recognition.fleet.status() if self._recognition.fleet is not None else None
+        localisation = self._recognition.localisation
         level = DiagnosticStatus.WARN
         if self._statistics.autosave_failure:
             level, text = DiagnosticStatus.ERROR, f"autosave: {self._statistics.autosave_failure}"
@@ -81,10 +82,13 @@ class Diagnostics:
             text = missing
         elif losses:
             text = losses[0]
+        elif localisation is not None and localisation.lost:
+            text = localisation.sentence()
         else:
             level, text = DiagnosticStatus.OK, self._sentence(rates, settings)
+        more = [part.values() for part in (fleet, localisation) if part is not None]
         values = self._values(rates, settings, inputs) | _shares(late, settings.node.image_topics)
-        self.publish(level, text, values | (fleet.values() if fleet is not None else {}))
+        self.publish(level, text, {k: v for some in (values, *more) for k, v in some.items()})
 
     def _losses(self, topics: Sequence[str], inputs: ImageInputs) -> list[str]:
         """What the middleware loses of late; each topic's is logged once."""

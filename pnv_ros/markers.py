@@ -1,23 +1,19 @@
 """~/markers: keyframes and closures to look at in RViz or Foxglove."""
 
-import math
-from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from threading import Lock
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Point
-from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
-from msg_adapters.images import stamp_of
+from pnv_core.decide.odometry import Odometry
 from pnv_core.types import ImageRef, LoopClosure
 from pnv_ros.node_config import NodeConfig
 
@@ -25,53 +21,30 @@ MARKERS_QOS = QoSProfile(
     depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL
 )
 
-_KEPT_POSES = 20_000  # 200 s at 100 Hz; keyframes take theirs within a second
 _KEPT_CLOSURES = 2000
-_NEAR_NS = 500_000_000  # a pose further in time than this is not the keyframe's
 _METRES_PER_SECOND = 0.1  # of the time-line
 _ARC_POINTS = 9
 
 
-class PoseTrack:
-    """Positions by stamp from an odometry or pose topic, and those of keyframes."""
+class Placing:
+    """Where keyframes stand by the poses of a `track`, in `frame_id`; None: the time-line places them."""
 
-    def __init__(self) -> None:
-        self._stamps: deque[int] = deque(maxlen=_KEPT_POSES)
-        self._positions: deque[tuple[float, float, float]] = deque(maxlen=_KEPT_POSES)
-        self._keyframes: dict[int, tuple[float, float, float]] = {}
-        self.frame_id = ""
+    def __init__(self, track: Odometry | None = None) -> None:
+        self.track, self.frame_id = track, ""
+        self._placed: dict[int, tuple[float, float, float]] = {}
 
-    def add(self, message: Any) -> None:
-        """Odometry or PoseStamped. One that is not newer than the last or not finite is ignored."""
-        pose = message.pose.pose if isinstance(message, Odometry) else message.pose
-        stamp_ns = stamp_of(message)
-        if not all(math.isfinite(v) for v in (pose.position.x, pose.position.y, pose.position.z)):
-            return
-        if self._stamps and stamp_ns <= self._stamps[-1]:
-            if self._stamps[-1] - stamp_ns < 1_000_000_000:
-                return
-            self._stamps.clear()
-            self._positions.clear()
-        self._stamps.append(stamp_ns)
-        self._positions.append((pose.position.x, pose.position.y, pose.position.z))
-        self.frame_id = message.header.frame_id
-
-    def at(self, stamp_ns: int) -> tuple[float, float, float] | None:
-        """The position nearest to a stamp, if there is one within half a second."""
-        stamps = list(self._stamps)
-        if not stamps:
-            return None
-        at = bisect_left(stamps, stamp_ns)
-        near = min((i for i in (at - 1, at) if 0 <= i < len(stamps)), key=lambda i: abs(stamps[i] - stamp_ns))
-        return self._positions[near] if abs(stamps[near] - stamp_ns) <= _NEAR_NS else None
+    def position(self, stamp_ns: int) -> tuple[float, float, float] | None:
+        """Where the robot was at a stamp, within half a second."""
+        at = self.track.at(stamp_ns) if self.track is not None else None
+        return None if at is None else at.xyz
 
     def place(self, refs: Sequence[ImageRef]) -> dict[int, tuple[float, float, float]]:
         """Positions of the keyframes that have one; those of keyframes not in `refs` are forgotten."""
-        known = {r.id: self._keyframes[r.id] for r in refs if r.id in self._keyframes}
+        known = {r.id: self._placed[r.id] for r in refs if r.id in self._placed}
         for ref in refs:
-            if ref.id not in known and (position := self.at(ref.stamp_ns)) is not None:
+            if ref.id not in known and (position := self.position(ref.stamp_ns)) is not None:
                 known[ref.id] = position
-        self._keyframes = known
+        self._placed = known
         return known
 
 
@@ -83,8 +56,7 @@ class Markers:
         self._publisher = node.create_publisher(MarkerArray, "~/markers", MARKERS_QOS)
         self._closures: deque[tuple[int, int, float]] = deque(maxlen=_KEPT_CLOSURES)
         self._lock = Lock()  # the worker adds, the timer publishes
-        self.track = PoseTrack()
-        self._posed = bool(config.odometry_topic or config.pose_topic)
+        self.placing = Placing()
         self._drawn: tuple[int, int, int] | None = None
 
     def close(self) -> None:
@@ -104,7 +76,8 @@ class Markers:
 
         To be called every second where poses place the keyframes, since poses are not kept for long.
         """
-        placed = self.track.place(refs_of()) if self._posed else None
+        posed = self.placing.track is not None
+        placed = self.placing.place(refs_of()) if posed else None
         if not config.publish_markers or not self._publisher.get_subscription_count():
             self._drawn = None
             return
@@ -117,8 +90,8 @@ class Markers:
         if state == self._drawn:
             return
         self._drawn = state
-        frame_id = (self._posed and self.track.frame_id) or config.frame_id
-        self._publisher.publish(map_markers(placed, closures, frame_id, arcs=not self._posed))
+        frame_id = (posed and self.placing.frame_id) or config.frame_id
+        self._publisher.publish(map_markers(placed, closures, frame_id, arcs=not posed))
 
 
 def timeline(refs: Sequence[ImageRef]) -> dict[int, tuple[float, float, float]]:

@@ -18,12 +18,14 @@ from pnv_core.errors import ConfigError, MapError, PnvError
 from pnv_core.maps import Autosave, SaveReport
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.rotations import mount_of
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
 from pnv_ros.companions import Companions
 from pnv_ros.diagnostics import Diagnostics
 from pnv_ros.fleet import start_fleet
 from pnv_ros.inputs import ImageInputs
+from pnv_ros.localisation import Localisation
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Parameters, Settings
 from pnv_ros.recognition import Recognition
@@ -169,6 +171,13 @@ class PlaceRecognizerNode(LifecycleNode):
         self._inputs.paused = on
         return "paused: images are dropped, the map is kept" if on else "running"
 
+    def relocalize(self) -> str:
+        if self._recognition is None:
+            raise PnvError(NOT_CONFIGURED)
+        if self._recognition.localisation is None:
+            raise PnvError("localization is false; allowed: true, with a map")
+        return self._recognition.localisation.publish_initial()
+
     def _map_and_recognition(self) -> tuple[SavedMap, Recognition]:
         if self._map is None or self._recognition is None:
             raise PnvError(NOT_CONFIGURED)
@@ -180,7 +189,7 @@ class PlaceRecognizerNode(LifecycleNode):
         config, start = self.settings.node, time.monotonic()
         views = self._views()
         describer = describer_from(self.settings.recogniser)
-        database = KeyframeDatabase.for_describer(describer, read_only=config.read_only)
+        database = KeyframeDatabase.for_describer(describer, read_only=config.localization)
         recognizer = PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
         like = _warm_up(describer)
         per_keyframe = database.bytes_per_keyframe(like)
@@ -194,8 +203,11 @@ class PlaceRecognizerNode(LifecycleNode):
         outputs = Outputs(self, config, describer.image_size, poses)
         self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
-        poses.offsets = dict(zip(config.image_topics, _triples(config.camera_in_base), strict=False))
-        self._companions = Companions(self, config, views, poses, recognizer.odometry, outputs.markers.track)
+        poses.mounts = dict(zip(config.image_topics, _mounts(config.camera_in_base), strict=False))
+        self._companions = Companions(self, config, views, poses, recognizer.odometry, outputs.markers.placing)
+        self._recognition.depths = self._companions.depths
+        if config.localization:
+            self._recognition.localisation = Localisation(self, config, poses)
         if why := why_conservative(describer.model.info.calibration, describer.config):
             self.get_logger().warning(why)
         self._map = SavedMap(database, describer.map_fingerprint)
@@ -297,6 +309,8 @@ class PlaceRecognizerNode(LifecycleNode):
             if self._recognition.fleet is not None:
                 self._recognition.fleet.close()
             self._recognition.outputs.close()
+            if self._recognition.localisation is not None:
+                self._recognition.localisation.close()
         if self._companions is not None:
             self._companions.close()
         if self._diagnostics is not None:
@@ -323,5 +337,5 @@ def _warm_up(describer: Describer) -> PlaceDescriptor:
     return describer.describe(np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8))
 
 
-def _triples(values: Sequence[float]) -> list[tuple[float, float, float]]:
-    return list(zip(values[::3], values[1::3], values[2::3], strict=True))
+def _mounts(values: Sequence[float]) -> list[NDArray[np.float64]]:
+    return [mount_of(values[i : i + 6]) for i in range(0, len(values), 6)]

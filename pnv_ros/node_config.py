@@ -39,13 +39,18 @@ class NodeConfig:
     )
     camera_in_base: tuple[float, ...] = setting(
         (),
-        "x, y, z of each camera in the robot's frame that odometry_topic moves: the camera's own way scales poses",
+        "where each camera is on the robot: x, y, z, roll, pitch, yaw of its housing, which looks along x",
         kind=float,
-        unit="m",
+        unit="m, rad",
         low=-100.0,
         high=100.0,
     )
-    pose_topic: str = setting("", "geometry_msgs/PoseStamped that places keyframes in ~/markers")
+    depth_topics: tuple[str, ...] = setting(
+        (), "depth images (16UC1 in mm, 32FC1 in m) aligned to the images, one per camera: poses in metres", kind=str
+    )
+    pose_topic: str = setting(
+        "", "geometry_msgs/PoseStamped of the robot in the map, as from a SLAM: places keyframes, instead of odometry"
+    )
 
     _time = Section("Time")
     on_stamp_back: str = setting(
@@ -63,7 +68,8 @@ class NodeConfig:
     load_on_start: bool = setting(False, "load map_path when configuring, if there is a map")
     autosave: bool = setting(False, "save to map_path every autosave_interval_s, at shutdown and at clean-up")
     autosave_interval_s: float = setting(300.0, "time between autosaves", unit="s", low=1.0, high=1e6)
-    read_only: bool = setting(False, "localise in the loaded map: nothing is added to it")
+    localization: bool = setting(False, "localise in the loaded map: nothing is added to it, fixes go out on ~/pose")
+    lost_after_s: float = setting(5.0, "lost when images of so long gave no fix", unit="s", low=0.1, high=1e6)
 
     _outputs = Section("Outputs")
     publish_candidates: bool = setting(True, "publish ~/candidates while somebody subscribes", live=True)
@@ -76,7 +82,7 @@ class NodeConfig:
     lio_sam_gap_s: float = setting(
         30.0, "least time between query and match of ~/lio_sam", unit="s", low=0.0, high=1e6, live=True
     )
-    frame_id: str = setting("map", "frame of ~/markers where poses name none", live=True)
+    frame_id: str = setting("map", "frame of ~/pose, and of ~/markers where poses name none", live=True)
 
     # Fleet
     fleet_uri: str = setting(
@@ -121,17 +127,22 @@ class NodeConfig:
             raise ConfigError(
                 f"camera_info_topics has {len(self.camera_info_topics)} entries; allowed: 0 or one per image topic"
             )
-        if len(self.camera_in_base) not in (0, 3 * len(topics)):
+        if len(self.camera_in_base) not in (0, 6 * len(topics)):
             raise ConfigError(
-                f"camera_in_base has {len(self.camera_in_base)} entries; allowed: 0 or x, y, z per image topic"
+                f"camera_in_base has {len(self.camera_in_base)} entries; "
+                "allowed: 0 or x, y, z, roll, pitch, yaw per image topic"
             )
+        if len(self.depth_topics) not in (0, len(topics)):
+            raise ConfigError(f"depth_topics has {len(self.depth_topics)} entries; allowed: 0 or one per image topic")
+        if self.depth_topics and not self.camera_info_topics:
+            raise ConfigError("depth_topics is given without camera_info_topics; allowed: both, or none")
         if not self.frame_id.strip():
             raise ConfigError(f"frame_id = {self.frame_id!r}; allowed: the name of a frame")
-        for name in ("image_topics", "camera_info_topics", "odometry_topic", "pose_topic"):
+        for name in ("image_topics", "camera_info_topics", "depth_topics", "odometry_topic", "pose_topic"):
             given = getattr(self, name)
             for topic in given if isinstance(given, tuple) else filter(None, [given]):
                 _check_topic(name, topic)
-        for name in ("load_on_start", "autosave", "read_only"):
+        for name in ("load_on_start", "autosave", "localization"):
             if getattr(self, name) and not self.map_path:
                 raise ConfigError(f"{name} is true but map_path is empty; allowed: a folder")
 

@@ -3,6 +3,7 @@
 import threading
 import time
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from typing import Any
 
 from rclpy.serialization import deserialize_message
@@ -13,6 +14,8 @@ from pnv_core.errors import ImageError, PnvError
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, LoopClosure
 from pnv_fleet.fleet import Fleet
+from pnv_ros.depths import Depths
+from pnv_ros.localisation import Localisation
 from pnv_ros.outputs import Outputs
 from pnv_ros.parameters import Settings
 from pnv_ros.slot import WaitingFrame
@@ -39,6 +42,8 @@ class Recognition:
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
         self._statistics, self._stamps, self._log = statistics, stamps, log
         self.fleet: Fleet | None = None
+        self.depths: Depths | None = None
+        self.localisation: Localisation | None = None
         self._session = 0
         self._wanted: Settings | None = None  # None: as configured
         self._taken: Settings | None = None
@@ -71,6 +76,8 @@ class Recognition:
             self.fleet.sessions(self.recognizer.database.refs())
         self.outputs.new_session()
         self.outputs.markers.forget()
+        if self.localisation is not None:
+            self.localisation.forget()
 
     def without_picture(self) -> str:
         """How many keyframes local features cannot examine although they should, in words; empty if none."""
@@ -114,6 +121,8 @@ class Recognition:
                 self._session = waiting.session
                 self.recognizer.new_session()
                 self.outputs.new_session()
+                if self.localisation is not None:
+                    self.localisation.forget()
             view = self.views[waiting.camera]
             if view.needs_info and view.rectifier is None:
                 self._statistics.drop(waiting.camera, Drop.NO_CAMERA_INFO)
@@ -131,6 +140,9 @@ class Recognition:
             if closures:
                 with self.recognizer.timer.stage("publish"):
                     self.outputs.publish(frame, closures, self._picture_of)
+            if self.localisation is not None and self.recognizer.latest is not None:
+                with self.recognizer.timer.stage("localise"):
+                    self.localisation.look(frame.stamp_ns, closures)
         accepted = sum(c.accepted for c in closures)
         self._statistics.process(waiting.camera, closures[0].score if closures else None, accepted, _in_words(closures))
         self._tell(closures, accepted)
@@ -141,7 +153,7 @@ class Recognition:
         if self.fleet is not None and query is not None:
             first = self.recognizer.database.first()
             oldest_ns = query.ref.stamp_ns if first is None else first.stamp_ns
-            self.fleet.offer(query, oldest_ns, self.outputs.markers.track.at(query.ref.stamp_ns))
+            self.fleet.offer(query, oldest_ns, self.outputs.markers.placing.position(query.ref.stamp_ns))
 
     def _picture_of(self, keyframe: int) -> bytes:
         return self.recognizer.database.picture(keyframe)
@@ -160,6 +172,8 @@ class Recognition:
                     f"images of {waiting.camera} changed from {known[0]}x{known[1]} to {size[0]}x{size[1]}; "
                     "both are resized to the model's input, but one topic should carry one camera",
                 )
+            if self.depths is not None:
+                frame = replace(frame, depth=self.depths.at(waiting.camera, frame.stamp_ns, size))
             return view(frame)
 
     def _tell(self, closures: list[LoopClosure], accepted: int) -> None:

@@ -13,6 +13,7 @@ from pnv_core.settings import Setting, settings_of
 from pnv_core.types import Reason
 from pnv_ros.bridges.config import BRIDGE_SETTINGS
 from pnv_ros.inputs import OVERRIDABLE, image_qos, qos_in_words
+from pnv_ros.localisation import POSE_QOS
 from pnv_ros.markers import MARKERS_QOS
 from pnv_ros.outputs import CLOSURES_QOS, PICTURE_QOS, TABLE_QOS
 from pnv_ros.parameters import DECLARED, NODE, RECOGNISER, preset_defaults
@@ -63,6 +64,7 @@ def interface_markdown() -> str:
         _PAGE.replace("{image_qos}", qos_in_words(image_qos()))
         .replace("{closures_qos}", f"{qos_in_words(CLOSURES_QOS)}, depth {CLOSURES_QOS.depth}")
         .replace("{table_qos}", f"{qos_in_words(TABLE_QOS)}, depth {TABLE_QOS.depth}")
+        .replace("{pose_qos}", f"{qos_in_words(POSE_QOS)}, depth {POSE_QOS.depth}")
         .replace("{picture_qos}", f"{qos_in_words(PICTURE_QOS)}, depth {PICTURE_QOS.depth}")
         .replace("{markers_qos}", f"{qos_in_words(MARKERS_QOS)}, depth {MARKERS_QOS.depth}")
         .replace("{overridable}", ", ".join(k.name.lower() for k in OVERRIDABLE))
@@ -126,8 +128,9 @@ Names without a leading slash are relative to the node's namespace, `~` is the n
 | --- | --- | --- | --- |
 | `image_topics` (`camera/image_raw`) | sensor_msgs/Image or CompressedImage | {image_qos}, depth 2 | the cameras |
 | `camera_info_topics` (none) | sensor_msgs/CameraInfo | best effort, volatile | optional; images are rectified by it |
+| `depth_topics` (none) | sensor_msgs/Image | best effort, volatile | optional; poses in metres |
 | `odometry_topic` (none) | nav_msgs/Odometry | best effort, volatile | optional; rules closures out, places keyframes |
-| `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; places keyframes in `~/markers` |
+| `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; places keyframes, in the map |
 
 A CameraInfo is taken anew whenever it changes, and refused where no camera has such numbers. Images of a topic with a
 part `image_rect...` in its name are taken as rectified: they stay as they are, and their `P` counts. Odometry is
@@ -160,6 +163,8 @@ match is reported with both profiles and the override to set.
 | `~/closures` | pnv_msgs/LoopClosureArray | {closures_qos} | as `loop_closures`, where pnv_msgs is installed |
 | `~/lio_sam` | std_msgs/Float64MultiArray | {table_qos} | best closure, limited by `lio_sam_interval_s` |
 | `~/relative_pose` | geometry_msgs/PoseWithCovarianceStamped | {table_qos} | best closure, where its scale is known |
+| `~/pose` | geometry_msgs/PoseWithCovarianceStamped | {pose_qos} | per fix, with `localization: true` |
+| `initialpose` | geometry_msgs/PoseWithCovarianceStamped | {pose_qos} | on `~/relocalize` |
 | `~/candidates` | sensor_msgs/PointCloud2 | {table_qos} | per query, while somebody subscribes |
 | `~/match_image` | sensor_msgs/Image | {picture_qos} | per query, while somebody subscribes |
 | `~/markers` | visualization_msgs/MarkerArray | {markers_qos} | on change, while somebody subscribes |
@@ -179,8 +184,18 @@ published where the package pnv_msgs can be imported; all else works without it.
 of the same session: LIO-SAM knows the stamps of its own run only, so nothing is sent about the places of a loaded map.
 
 **`~/relative_pose`**: the query's camera (optical frame) in the frame `keyframe_<match id>`, in metres. It needs
-`camera_info_topics` and, for the scale, `odometry_topic`; sent while somebody subscribes. With
-`read_only` none is sent, since the query is no keyframe (its id is -1); nor do its closures appear in `~/markers`.
+`camera_info_topics` and a scale: `depth_topics` here or when the keyframe was taken, a stereo pair (two image topics
+whose CameraInfo says in P how far apart they are), or the way of `odometry_topic` between two images. Where no scale is
+known none is sent; `~/closures` then carries rotation and direction. Sent while somebody subscribes. The covariance is
+about the axes of the match's frame. With `localization` the closures' queries are no keyframes (their id is -1) and do
+not appear in `~/markers`.
+
+**`~/pose`**, with `localization: true`: the robot (the base that `camera_in_base` speaks of) in the frame of the map's
+poses, named `frame_id`, at every image that gave a fix: an accepted closure with a metric pose, of a keyframe that has
+one itself. Keyframes have the poses that `pose_topic`, or else `odometry_topic`, gave while the map was made; those of
+odometry count for the map's first session, since every later one began elsewhere. The covariance is that of the sight:
+what the map's own poses are worth is not known. Nothing vaguer is sent: where nothing is recognised, or no scale or
+pose is known, `/diagnostics` says `lost` and why, and always the time since the last fix.
 
 **`~/candidates`**: every candidate examined, refused ones too, one point each: {candidate_fields}. Reasons:
 
@@ -193,6 +208,7 @@ of the same session: LIO-SAM knows the stamps of its own run only, so nothing is
 | `~/save` | std_srvs/Trigger | write the map to `map_path` |
 | `~/load` | std_srvs/Trigger | replace the map by the one at `map_path`; a new session begins |
 | `~/reset` | std_srvs/Trigger | forget every keyframe, and the stamps seen |
+| `~/relocalize` | std_srvs/Trigger | publish the last fix on `initialpose`; refused where the robot is lost |
 | `~/pause` | std_srvs/SetBool | drop images until set to false; the map is kept |
 | `~/save_map` | pnv_msgs/SaveMap | `~/save` to another path this once |
 | `~/load_map` | pnv_msgs/LoadMap | `~/load` from another path this once |

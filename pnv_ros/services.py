@@ -1,4 +1,4 @@
-"""The services: save, load, reset, pause. Each answers with what it did, or why not."""
+"""The services: save, load, reset, pause, relocalize. Each answers with what it did, or why not."""
 
 import threading
 from collections.abc import Callable
@@ -15,17 +15,18 @@ from pnv_core.errors import PnvError
 class Controls(Protocol):
     """What a service may do to the node. Each gives a sentence or raises PnvError or OSError.
 
-    save, load and reset are called from threads of their own, one at a time; pause from the callbacks' thread.
+    save, load and reset are called from threads of their own, one at a time; the others from the callbacks' thread.
     """
 
     def save(self) -> str: ...
     def load(self) -> str: ...
     def reset(self) -> str: ...
     def pause(self, on: bool) -> str: ...
+    def relocalize(self) -> str: ...
 
 
 class Services:
-    """~/save, ~/load, ~/reset (std_srvs/Trigger) and ~/pause (std_srvs/SetBool).
+    """~/save, ~/load, ~/reset, ~/relocalize (std_srvs/Trigger) and ~/pause (std_srvs/SetBool).
 
     The first three may take seconds. They run beside the executor, which goes on with images meanwhile.
     """
@@ -40,7 +41,11 @@ class Services:
         def pause(request: Any, response: Any) -> Any:
             return self._answered(response, _outcome(lambda: controls.pause(request.data)))
 
+        def relocalize(_: Any, response: Any) -> Any:
+            return self._answered(response, _outcome(controls.relocalize))
+
         node.create_service(SetBool, "~/pause", pause)
+        node.create_service(Trigger, "~/relocalize", relocalize)
 
     @property
     def idle(self) -> bool:

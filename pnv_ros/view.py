@@ -27,18 +27,21 @@ class View:
     def __call__(self, frame: Frame) -> Frame:
         """Raises ImageError where nothing is left of the image."""
         height, width = frame.rgb.shape[:2]
-        rgb, valid = frame.rgb, self._valid(width, height)
+        rgb, valid, depth = frame.rgb, self._valid(width, height), frame.depth
         rectifier = self.rectifier  # may be replaced by another thread
         if rectifier is not None:
             seen = np.full((height, width), 255, np.uint8) if valid is None else valid
             rgb, valid = rectifier(rgb), rectifier(seen)
+            if depth is not None:
+                depth = rectifier(depth)
         left, top, right, bottom = self._crop
         if width - left - right < MIN_SIDE or height - top - bottom < MIN_SIDE:
             raise ImageError(f"crop = {list(self._crop)} leaves {width - left - right}x{height - top - bottom} of a "
                              f"{width}x{height} image; allowed: at least {MIN_SIDE}x{MIN_SIDE}")  # fmt: skip
         window = slice(top, height - bottom), slice(left, width - right)
         return dataclasses.replace(frame, rgb=np.ascontiguousarray(rgb[window]),
-                                   valid=None if valid is None else valid[window] > 127)  # fmt: skip
+                                   valid=None if valid is None else valid[window] > 127,
+                                   depth=None if depth is None else depth[window])  # fmt: skip
 
     @property
     def scalable(self) -> bool:

@@ -1,29 +1,23 @@
 """Where keyframes stand in ~/markers, by themselves."""
 
-from geometry_msgs.msg import PoseStamped
-
+from pnv_core.decide.odometry import Odometry
 from pnv_core.types import ImageRef
-from pnv_ros.markers import PoseTrack, map_markers, timeline
+from pnv_ros.markers import Placing, map_markers, timeline
 
 SECOND = 10**9
 
 
-def pose(seconds, x):
-    message = PoseStamped()
-    message.header.stamp.sec, message.header.frame_id, message.pose.position.x = seconds, "odom", x
-    return message
-
-
 def test_a_keyframe_stands_at_the_pose_nearest_in_time_and_stays_there():
-    track = PoseTrack()
+    track = Odometry()
+    markers = Placing(track)
     for seconds in range(10):
-        track.add(pose(seconds, float(seconds)))
+        track.add(seconds * SECOND, float(seconds), 0.0, 0.0)
     refs = [ImageRef(0, 3 * SECOND + 400_000_000, "front"), ImageRef(1, 20 * SECOND, "front")]
-    assert track.place(refs) == {0: (3.0, 0.0, 0.0)}  # nothing is known of the second one
+    assert markers.place(refs) == {0: (3.0, 0.0, 0.0)}  # nothing is known of the second one
     for seconds in range(10, 30_000):
-        track.add(pose(seconds, float(seconds)))
-    assert track.place(refs[:1]) == {0: (3.0, 0.0, 0.0)}  # long after its poses were forgotten
-    assert track.place([]) == {}
+        track.add(seconds * SECOND, float(seconds), 0.0, 0.0)
+    assert markers.place(refs[:1]) == {0: (3.0, 0.0, 0.0)}  # long after its poses were forgotten
+    assert markers.place([]) == {}
 
 
 def test_without_poses_keyframes_stand_on_a_time_line_per_camera_and_session():

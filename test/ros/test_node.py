@@ -151,7 +151,7 @@ def test_a_node_restarted_with_its_map_recognises_yesterdays_places(domain, list
         assert trigger(listener, "load").success  # back to what was saved
         node.child.send_signal(signal.SIGKILL)
         node.wait()
-    with running_node(**keep | {"read_only": True, "autosave": False}) as node:
+    with running_node(**keep | {"localization": True, "autosave": False}) as node:
         node.wait_for("loaded 4 keyframes")
         closures.clear()
         health = Health(listener)
