@@ -27,10 +27,13 @@ from pnv_core.describe.describer import Describer, describer_from
 from pnv_core.describe.download import resolve_weights
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import LoopClosure, PatchGrid, PlaceDescriptor
-from pnv_core.verify.local_features import RootSIFTVerifier, thumbnail
-from pnv_lab.calibrating import SURE_REVISIT
+from pnv_core.verify.local_features import MOST, WIDTH
+from pnv_core.verify.verifier import Verifier
+from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
+CAUTION = 1.7  # what a false candidate counts in the fit: look-alike corridors are rarer there than in buildings
+_SURE_MOTION = 24  # SIFT features on one geometry, three times what chance gives
 
 
 class RememberedDescriber:
@@ -75,6 +78,30 @@ class RememberedDescriber:
         np.savez(self._file, numbers=numbers, vectors=vectors, texture=texture, **patches)
 
 
+class RememberedVerifier:
+    """The verifier of a recogniser, with what it kept of the images of a sequence read from the cache."""
+
+    def __init__(self, verifier: Verifier, images: TruthSequence, cache: Path) -> None:
+        cache.mkdir(parents=True, exist_ok=True)
+        keys = zlib.crc32("\n".join(images.keys).encode())
+        self._file = cache / f"{type(verifier).__name__}_{WIDTH}_{MOST}_{images.name}_{keys:08x}.npz"
+        self._verifier = verifier
+        self._kept: dict[int, bytes] = {}
+        self.at = 0
+        self.prepare, self.check = verifier.prepare, verifier.check
+        if self._file.exists():
+            with np.load(self._file) as stored:
+                self._kept = {int(number): stored[number].tobytes() for number in stored.files}
+
+    def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
+        if self.at not in self._kept:
+            self._kept[self.at] = self._verifier.keep(rgb, camera, valid)
+        return self._kept[self.at]
+
+    def save(self) -> None:
+        np.savez(self._file, **{str(i): np.frombuffer(kept, np.uint8) for i, kept in self._kept.items()})
+
+
 @dataclass(frozen=True, eq=False)
 class Judged:
     """What the recogniser said of a sequence: per query keyframe its candidates with their truth, best first.
@@ -85,21 +112,28 @@ class Judged:
     name: str
     queries: list[list[tuple[LoopClosure, int]]]
     loops: NDArray[np.bool_]
+    numbers: list[tuple[int, list[int]]]  # of the query image and of its candidates'
 
     def candidates(self) -> Iterator[tuple[LoopClosure, int]]:
         return ((c, label) for found in self.queries for c, label in found if label in (TRUE, FALSE))
 
 
 def small_motion(query: NDArray[np.uint8], match: NDArray[np.uint8]) -> bool:
-    """Whether two images show one place from a little farther on, whatever the ground truth knows.
+    """Whether two images show one place from a little farther on, whatever the ground truth and the verifier know.
 
-    Three times as many local features as chance gives agree on one epipolar geometry, and the similarity transform
-    between them magnifies by less than two and rolls by less than 20 degrees.
+    24 SIFT features or more agree on one epipolar geometry, and the similarity transform between them magnifies by less
+    than two and rolls by less than 20 degrees.
     """
-    check = RootSIFTVerifier().check(thumbnail(query), "", thumbnail(match), "")
-    if check.inliers < SURE_REVISIT:
+    one, other = (sift_record(image, (320, 320 * image.shape[0] // image.shape[1])) for image in (query, match))
+    q, m = ratio_matches(one["descriptors"], other["descriptors"])
+    if len(q) < _SURE_MOTION:
         return False
-    transform, _ = cv2.estimateAffinePartial2D(check.reference[check.inlier], check.query[check.inlier])
+    points, seen = one["points"][q], other["points"][m]
+    _, mask = cv2.findFundamentalMat(points, seen, cv2.FM_RANSAC, 1.5, 0.99)
+    inlier = np.zeros(len(q), bool) if mask is None else mask.ravel() > 0
+    if inlier.sum() < _SURE_MOTION:
+        return False
+    transform, _ = cv2.estimateAffinePartial2D(seen[inlier], points[inlier])
     if transform is None:
         return False
     scale = math.hypot(transform[0, 0], transform[1, 0])
@@ -118,6 +152,7 @@ def judged(
     remembered = RememberedDescriber(describer, images, cache)
     remembered.config = config
     recognizer = PlaceRecognizer(remembered)  # type: ignore[arg-type]
+    verifier = recognizer.judge.verifier = RememberedVerifier(recognizer.judge.verifier, images, cache)
     image_of: dict[int, int] = {}
 
     def truth(i: int, closure: LoopClosure) -> int:
@@ -132,11 +167,11 @@ def judged(
             cv2.imwrite(str(pictures / name), np.hstack([image[:height] for image in pair])[:, :, ::-1])
         return label
 
-    queries, loops = [], []
+    queries, loops, numbers = [], [], []
     for i, frame in enumerate(images.frames()):
         if i in images.starts:
             recognizer.new_session()
-        remembered.at = i
+        remembered.at = verifier.at = i
         before = recognizer.database.refs()
         closures = recognizer.process(frame)
         if (last := recognizer.database.last()) is not None and last.id not in image_of:
@@ -150,12 +185,15 @@ def judged(
             ]
             if counted and old and not (images.starts and i < images.starts[0]):
                 queries.append([(c, truth(i, c)) for c in closures])
+                numbers.append((i, [image_of[c.match.id] for c in closures]))
                 loops.append(any(images.truth(i, image_of[r.id]) == TRUE for r in old))
             elif images.queries is not None and old and not images.starts:  # no loop is known here: closures are false
                 queries.append([(c, truth(i, c)) for c in closures])
+                numbers.append((i, [image_of[c.match.id] for c in closures]))
                 loops.append(False)
     remembered.save()
-    return Judged(images.name, queries, np.array(loops, bool))
+    verifier.save()
+    return Judged(images.name, queries, np.array(loops, bool), numbers)
 
 
 def examples(found: Judged) -> tuple[list, list[bool]]:
@@ -164,17 +202,14 @@ def examples(found: Judged) -> tuple[list, list[bool]]:
 
 
 def fit(shared: Path, describer: Describer, cache: Path, names: tuple[str, ...]) -> Calibration:
-    """The calibration of the sets that may train a shipped model; every set counts the same."""
+    """The calibration of the sets that may train a shipped model; every set counts the same, its false ones more."""
     evidence, truth, weights = [], [], []
     for name in names:
         found = judged(sequence(name, shared), describer, cache, verify=4, consistency=0, accept_score=1.0)
         e, t = examples(found)
-        if name == "tower":
-            unclear = [x.local_inliers >= SURE_REVISIT and not true for x, true in zip(e, t, strict=True)]
-            e, t = ([v for v, u in zip(values, unclear, strict=True) if not u] for values in (e, t))
         evidence += e
         truth += t
-        weights += [1.0 / len(e)] * len(e)
+        weights += [(1.0 if true else CAUTION) / len(e) for true in t]
         print(f"{name:<16} {len(found.queries):5d} queries {len(e):6d} candidates {sum(t):5d} true", flush=True)
     return fit_calibration(
         list(zip(evidence, truth, strict=True)), np.array(weights), describer.config, ", ".join(names)

@@ -274,10 +274,11 @@ def _poses(args: argparse.Namespace) -> "Poses | None":
 
 
 def _recorder(recognizer: "PlaceRecognizer") -> "RunRecorder":
+    from pnv_core.verify.feature_codes import picture_of
     from pnv_lab.evaluation.run_report import RunRecorder
 
     def kept_picture(ref: "ImageRef") -> bytes:
-        return recognizer.database.descriptor(ref.id).thumbnail if ref.id in recognizer.database else b""
+        return picture_of(recognizer.database.picture(ref.id))
 
     return RunRecorder(recognizer.describer.image_size, recognizer.database.session, kept_picture)
 

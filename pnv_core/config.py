@@ -118,7 +118,7 @@ class Config:
         high=1.0,
     )
     verifier: str = setting(
-        "rootsift", "what examines the best candidates beside their patches: rootsift, or a registered name"
+        "xfeat", "what examines the best candidates beside their patches: xfeat, or a registered name"
     )
     verify: int = setting(
         3,

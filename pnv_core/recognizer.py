@@ -88,7 +88,7 @@ class PlaceRecognizer:
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
             self.odometry.remember(query)
-        self.latest = Query(query, descriptor, predecessor, frame.valid)
+        self.latest = Query(query, descriptor, predecessor)
         closures = [replace(c, query=query) for c in closures]
         self.sequence.remember(frame.camera, closures, window_of(self.config.consistency + DOUBT))
         return sorted(map(self._decided, closures), key=rank)

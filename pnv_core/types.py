@@ -79,7 +79,7 @@ class PlaceDescriptor:
     """What is remembered of an image: a unit global vector (D,) float32 and one PatchGrid per patch size.
 
     `texture` in [0, 1] is the share of the image that is not blank; it gates meaningless matches.
-    `thumbnail` is a small grey JPEG for local features, empty where none is kept.
+    `thumbnail` is what the verifier keeps of the image, with a small grey JPEG at its end; empty where none is kept.
     """
 
     global_vector: NDArray[np.float32]
@@ -105,7 +105,7 @@ class ImageRef:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """What a keyframe is looked up with, here or by others: which it is, its descriptor, the pixels it may use.
+    """What a keyframe is looked up with, here or by others: which it is and its descriptor.
 
     `predecessor` is the cosine to the keyframe before it, 1 where there is none.
     """
@@ -113,7 +113,6 @@ class Query:
     ref: ImageRef
     descriptor: PlaceDescriptor
     predecessor: float
-    valid: NDArray[np.bool_] | None = None  # as in Frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +162,7 @@ class Evidence:
     texture: float = 1.0  # the lesser of both images, in [0, 1]
     local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined, -2: no picture to examine
     local_spread: float = 0.0  # of those
-    local_matches: int = 0  # local features that matched at all, whether they agree or not
+    local_matches: int = 0  # mutual nearest neighbours among the local features, whether they agree or not
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
 
 

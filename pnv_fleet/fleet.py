@@ -223,7 +223,7 @@ class Fleet:
         ref = query.ref
         self._newest_ns = max(self._newest_ns, ref.stamp_ns)
         session = self._sessions.setdefault(ref.session, ref.stamp_ns)
-        seen = without_picture(query.descriptor, query.valid)
+        seen = without_picture(query.descriptor)
         shared = None
         if ref.id >= 0:
             kept = query.descriptor if self.options.pictures else seen

@@ -34,7 +34,7 @@ PART_BYTES = PART_CHARACTERS // 4 * 3
 MOST_PARTS = 48  # a collection of Milvus has at most 64 fields
 MOST_DIM = 32_768  # of a vector of Milvus
 MOST_PICTURE = 1 << 17
-_MAGIC, _JPEG = b"PNVV", b"\xff\xd8"
+_MAGIC = b"PNVV"
 _HEAD = struct.Struct("<4sIH")
 _LARGEST_STAMP = 2**31 * 10**9  # what the messages of ROS hold
 _NAME = re.compile(r"[A-Za-z0-9_.:/-]{1,64}")
@@ -95,12 +95,9 @@ def encode_view(descriptor: PlaceDescriptor) -> bytes:
     return _MAGIC + struct.pack("<I", zlib.crc32(length + body)) + length + body
 
 
-def without_picture(descriptor: PlaceDescriptor, valid: NDArray[np.bool_] | None = None) -> PlaceDescriptor:
-    """The same with the features of the thumbnail in its place; what is no picture stays as it is."""
-    if not descriptor.thumbnail.startswith(_JPEG):
-        return descriptor
-    codes = features_of(descriptor.thumbnail, valid)
-    return PlaceDescriptor(descriptor.global_vector, descriptor.patches, descriptor.texture, codes)
+def without_picture(descriptor: PlaceDescriptor) -> PlaceDescriptor:
+    """The same with the features alone of what was kept to verify it; what is neither features nor picture stays."""
+    return replace(descriptor, thumbnail=features_of(descriptor.thumbnail))
 
 
 def parts_of(layouts: tuple[GridLayout, ...]) -> int:

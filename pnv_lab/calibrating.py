@@ -17,7 +17,8 @@ from pnv_lab.poses import read_poses
 # Is it the same place? None where that is not known. Arguments: name and stamp [ns] of query and match.
 Truth = Callable[[str, int, str, int], bool | None]
 
-SURE_REVISIT = 24  # local inliers, three times what chance gives: an unlabelled loop rather than a look-alike
+# local inliers, three times what other places have by chance: an unlabelled loop rather than a look-alike
+SURE_REVISIT = 36
 
 
 @dataclass(frozen=True, eq=False)

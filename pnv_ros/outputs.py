@@ -19,7 +19,7 @@ from msg_adapters.typed_closures import closures_to_typed, typed_type
 from pnv_core.drawing import draw_match
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.types import Frame, LoopClosure
-from pnv_core.verify.feature_codes import packed
+from pnv_core.verify.feature_codes import picture_of as kept_picture
 from pnv_core.verify.local_features import decoded
 from pnv_ros.markers import Markers
 from pnv_ros.node_config import NodeConfig
@@ -112,7 +112,8 @@ class Outputs:
         picture = draw_match(frame.rgb, self._unpacked(reference), closure.matches, self._size, caption)
         return rgb_to_message(picture, frame.stamp_ns, self.config.frame_id)
 
-    def _unpacked(self, picture: bytes) -> NDArray[np.uint8]:
-        if not picture or packed(picture):
+    def _unpacked(self, kept: bytes) -> NDArray[np.uint8]:
+        picture = kept_picture(kept)
+        if not picture:
             return np.full((self._size[1], self._size[0], 3), 64, np.uint8)
         return cv2.cvtColor(decoded(picture), cv2.COLOR_GRAY2RGB)

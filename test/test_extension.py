@@ -24,6 +24,9 @@ class SamePicture:
 
     side = 32
 
+    def __init__(self, config):
+        pass
+
     def keep(self, rgb, camera, valid=None):
         return rgb[::32].mean((1, 2)).astype(np.float32).tobytes()
 
@@ -87,7 +90,7 @@ def test_a_verifier_from_outside_is_asked_and_believed(toy_model):
 def test_unknown_parts_are_refused_by_name(toy_model):
     with pytest.raises(ModelError, match=r"trunk = 'resnet' is not known; allowed: one of vgg16, .*rootsift"):
         TRUNKS.make("resnet")
-    with pytest.raises(ConfigError, match=r"verifier = 'eyes' is not known; allowed: one of rootsift"):
+    with pytest.raises(ConfigError, match=r"verifier = 'eyes' is not known; allowed: one of xfeat"):
         PlaceRecognizer(Describer(toy_model, Config(verifier="eyes", threads=1)))
     with pytest.raises(ConfigError, match=r"index = 'tree' is not known; allowed: one of auto, exact, pq"):
         PlaceRecognizer(Describer(toy_model, Config(index="tree", threads=1)))

@@ -382,7 +382,7 @@ class KeyframeDatabase:
         return found
 
     def picture(self, keyframe: int) -> bytes:
-        """The small picture of a keyframe; empty where none is kept, or the keyframe is gone or unreadable."""
+        """What is kept of a keyframe to verify it; empty where nothing is, or the keyframe is gone or unreadable."""
         return self._rest(keyframe)[0]
 
     def geometry(self, keyframe: int) -> bytes:

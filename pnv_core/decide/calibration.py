@@ -25,9 +25,21 @@ Array = NDArray[np.float64]
 
 CHANCE = 8  # as many local features agree on some epipolar geometry by chance
 _LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
+_FEW_MATCHES = 40  # of fewer the share means little
 
-# Every feature grows with the belief in the candidate. Similarity and the leads are left out where local features
-# speak: fitted on some sets and judged on others they cost more than they give, as their scale is that of a place.
+
+def support(evidence: Evidence) -> float:
+    """The share of the mutual local matches that agree, times the square of the spatial score, as a logarithm.
+
+    Neither tells look-alike corridors from a place by night: they agree in as many features, and their patches agree
+    as well as those of a place by night; but not in both at once.
+    """
+    agreeing = max(evidence.local_inliers - CHANCE / 2, 1.0) / max(evidence.local_matches, _FEW_MATCHES)
+    return math.log(agreeing) + 2.0 * math.log(max(evidence.spatial, 0.01) / 0.01)
+
+
+# Every feature grows with the belief in the candidate. Where local features speak one feature serves: with more of
+# them, fitted on some sets and judged on others, look-alike corridors pass.
 _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
     "patches": {
         "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
@@ -38,6 +50,10 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "recent_lead": lambda e: e.recent_lead,
         "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
     },
+    "verified": {"support": support},
+}
+_OLDER: dict[str, dict[str, Callable[[Evidence], float]]] = {  # what files of other verifiers name
+    "patches": {},
     "verified": {
         "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
         "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
@@ -46,7 +62,7 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "local_share": lambda e: max(e.local_inliers, 0) / (e.local_matches + CHANCE),
     },
 }
-_VALUES = _FEATURES["patches"] | _FEATURES["verified"]
+_VALUES = _FEATURES["patches"] | _FEATURES["verified"] | _OLDER["verified"]
 
 
 # bounds of what a file may say
@@ -129,17 +145,19 @@ class Calibration:
             raise ModelError(f"calibration is incomplete or malformed ({error}); refit: pnv calibrate") from None
         for name, features in _FEATURES.items():
             model: Logistic = getattr(written, name)
-            if set(model.weights) - set(features) or not np.isfinite([model.bias, *model.weights.values()]).all():
+            known = set(features) | set(_OLDER[name])
+            if set(model.weights) - known or not np.isfinite([model.bias, *model.weights.values()]).all():
                 allowed = ", ".join(features)
                 raise ModelError(f"calibration.{name} = {given[name]}; allowed: weights >= 0 of {allowed}")
         return cls(**vars(written))
 
 
 # For models without a calibration of their own. The patch part never passes 0.5: patch scores of an unknown model have
-# an unknown scale. Local features are the same whatever the model: at a spatial score of 0.2, 20 of them are worth 0.5.
+# an unknown scale. Local features are the same whatever the model: at a spatial score of 0.2 a sixth of the mutual
+# matches that agree is worth 0.5.
 CONSERVATIVE = Calibration(
     Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0}),
-    Logistic(-4.0, {"spatial": 1.0, "regularity": 1.0, "local_inliers": 6.0}),
+    Logistic(-9.2, {"support": 2.2}),
     source="no calibration of this model",
 )
 

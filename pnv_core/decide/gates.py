@@ -4,11 +4,10 @@ from dataclasses import replace
 
 from pnv_core.config import Config
 from pnv_core.decide.calibration import CHANCE
-from pnv_core.decide.consistency import DOUBT, PRIOR, SequenceMemory, confirmed, window_of
+from pnv_core.decide.consistency import DOUBT, SequenceMemory, confirmed, window_of
 from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
-_AGREE = 0.6  # share of the matched local features; look-alike walls have less (median 0.45), true revisits 0.6 to 0.9
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
@@ -25,12 +24,11 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
     wanted = config.consistency
     path = sequence.path(closure, window_of(wanted))
     alone = wanted <= 1  # nothing beyond the closure itself is asked for
-    agreed = alone or (confirmed(path, wanted) and closure.score >= PRIOR)
+    agreed = alone or confirmed(path, wanted)
     belief = closure.score if alone or not agreed else max(closure.score, path.belief)
-    if belief < config.accept_score:
+    if closure.score < config.accept_score:  # frames that agree lift no weak one: look-alike corridors agree in order
         return replace(closure, reason=Reason.LOW_SCORE)
-    unexamined = evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE
-    if config.verify and (unexamined or chancy(evidence)):
+    if config.verify and evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE:
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)
@@ -41,11 +39,6 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         if not confirmed(longer, wanted + DOUBT):
             return replace(closure, reason=Reason.AMBIGUOUS)
     return replace(closure, score=belief, accepted=True)
-
-
-def chancy(evidence: Evidence) -> bool:
-    """Whether of the local features that matched too few agree on one geometry: what is left may agree by chance."""
-    return 0 <= evidence.local_inliers < _AGREE * evidence.local_matches
 
 
 def ambiguous(evidence: Evidence) -> bool:

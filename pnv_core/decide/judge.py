@@ -23,7 +23,7 @@ class Judge:
     def __init__(self, config: Config, stored_calibration: dict | None, steps: Steps | None = None) -> None:
         self._steps = steps or by_id
         self.reranker = Reranker(config)
-        self.verifier = VERIFIERS.make(config.verifier)
+        self.verifier = VERIFIERS.make(config.verifier, config)
         self.calibration: Calibration = calibration_for(stored_calibration, config)
 
     def judge(

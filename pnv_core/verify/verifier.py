@@ -32,7 +32,7 @@ class EpipolarCheck:
 
 
 class Verifier(Protocol):
-    """Compares two images by what it kept of each: a picture or features, as bytes that go into the map."""
+    """Compares two images by what it kept of each, as bytes that go into the map. Made from the completed Config."""
 
     side: int  # pixels it looks at along the longer side of an image; more tell it nothing
 
@@ -50,7 +50,7 @@ class Verifier(Protocol):
 
 
 VERIFIERS: Registry[Verifier] = Registry(
-    "verifier", {"rootsift": "pnv_core.verify.local_features:RootSIFTVerifier"}, ConfigError
+    "verifier", {"xfeat": "pnv_core.verify.local_features:XFeatVerifier"}, ConfigError
 )
 
 

@@ -33,12 +33,13 @@ CONFIG = Config.make(
 
 
 def drawn(rng, n, examined=True):
-    """Evidence whose truth follows a logistic law in local inliers and spatial score."""
+    """Evidence whose truth follows a logistic law in the share of local inliers and the spatial score."""
     found = []
     for _ in range(n):
         inliers, spatial = int(rng.integers(8, 60)), float(rng.uniform(0.02, 0.4))
-        logit = -5.0 + 3.0 * np.log(inliers / 8) + 1.0 * (np.log(spatial) + 3)
-        e = Evidence(0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_spread=0.2)
+        matches = int(rng.integers(inliers, 250))
+        logit = 4.0 + 1.5 * np.log((inliers - 4) / max(matches, 40)) + 3.0 * (np.log(spatial) + 2)
+        e = Evidence(0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_matches=matches)
         found.append((e, bool(rng.random() < 1 / (1 + np.exp(-logit))), 1 / (1 + np.exp(-logit))))
     return found
 
@@ -124,8 +125,9 @@ def test_the_calibration_lives_in_the_model_file_and_leaves_the_model_as_it_is(t
     save_model(small_model(), path)
     before = load_model(path)
     calibration = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"local_inliers": 3.0}), "ransac", (2, 3), (320, 240), "a test"
-    )
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"support": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        verifier="xfeat",
+    )  # fmt: skip
     write_calibration(path, calibration)
     after = load_model(path)
     assert after.fingerprint() == before.fingerprint()
@@ -135,11 +137,15 @@ def test_the_calibration_lives_in_the_model_file_and_leaves_the_model_as_it_is(t
 
 
 def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
-    stored = Calibration(Logistic(0.0, {}), Logistic(0.0, {}), "ransac", (2, 3), (320, 240), "").to_json()
+    fitted = Calibration(Logistic(0.0, {}), Logistic(0.0, {}), "ransac", (2, 3), (320, 240), "", verifier="xfeat")
+    stored = fitted.to_json()
     assert calibration_for(stored, CONFIG) is not CONSERVATIVE
     assert calibration_for(stored, CONFIG.replace(scorer="rapid")) is CONSERVATIVE
     assert calibration_for(stored, CONFIG.replace(image_width=640)) is CONSERVATIVE
     assert calibration_for(None, CONFIG) is CONSERVATIVE
+    older = {name: value for name, value in stored.items() if name != "verifier"}  # when there was RootSIFT alone
+    older["verified"] = {"bias": -4.0, "weights": {"spatial": 1.0, "local_inliers": 3.0}}
+    assert calibration_for(older, CONFIG) is CONSERVATIVE
 
 
 def test_a_calibration_holds_for_the_settings_that_shape_the_evidence_it_was_fitted_on():

@@ -13,7 +13,7 @@ from pnv_core.database import KeyframeDatabase
 from pnv_core.errors import PnvError
 from pnv_core.maps import MapStore
 from pnv_core.types import PatchGrid, PlaceDescriptor
-from pnv_core.verify.local_features import WIDTH, decoded, detect
+from pnv_core.verify.local_features import XFeatVerifier, decoded
 from test.maps.test_closures import small_frames, small_recognizer
 from test.maps.worlds import contents
 from test.tally import count, tally
@@ -28,7 +28,7 @@ def bomb() -> bytes:
 
 
 BOMB = bomb()
-PICTURES = [b"", b"\xff\xd8\xff", b"PNVF", BOMB, BOMB[:2000], cv2.imencode(".png", np.zeros((9, 9)))[1].tobytes()]
+PICTURES = [b"", b"\xff\xd8\xff", b"PNVX", b"PNVX\xff\xff" + bytes(4000), BOMB, BOMB[:2000], cv2.imencode(".png", np.zeros((9, 9)))[1].tobytes()]
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,11 @@ def test_keyframes_that_no_describer_gave_are_refused_or_harmless(tmp_path_facto
 
 
 def test_a_picture_that_unpacks_to_more_than_a_thumbnail_is_not_unpacked():
+    verifier = XFeatVerifier()
     tracemalloc.start()
     try:
-        assert decoded(BOMB).shape == (WIDTH, WIDTH)
-        assert len(detect(BOMB).points) == 0
+        assert decoded(BOMB).shape == (320, 320)
+        assert len(verifier.features(BOMB)[0].points) == 0
         assert tracemalloc.get_traced_memory()[1] < 20_000_000
     finally:
         tracemalloc.stop()

@@ -4,7 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pnv_core.verify.local_features import RootSIFTVerifier, detect, epipolar_check, thumbnail
+from pnv_core.verify.local_features import XFeatVerifier, epipolar_check, thumbnail
+
+VERIFIER = XFeatVerifier()
 
 
 def scene(seed, size=(480, 640)):
@@ -25,7 +27,7 @@ def view(image, shift, scale):
 
 
 def features(image, valid=None):
-    return detect(thumbnail(image), valid)
+    return VERIFIER.found(image, valid)
 
 
 def test_two_views_of_one_scene_agree_and_their_points_are_where_the_views_put_them():
@@ -35,7 +37,7 @@ def test_two_views_of_one_scene_agree_and_their_points_are_where_the_views_put_t
     assert check.spread > 0.3
     expected = check.query * 1.1 + np.array([30, -20]) / 640
     error = np.linalg.norm(expected - check.reference, axis=1)[check.inlier]
-    assert np.median(error) < 1.0 / 320  # a thumbnail pixel
+    assert np.median(error) < 1.0 / 320  # two pixels
 
 
 def test_other_scenes_agree_by_chance_only():
@@ -52,7 +54,7 @@ def test_a_blank_picture_has_no_features_and_agrees_with_nothing():
 
 def test_a_damaged_picture_of_a_map_agrees_with_nothing():
     damaged = b"\xff\xd8\xff no picture"
-    assert RootSIFTVerifier().check(thumbnail(scene(0)), "front", damaged, "front").inliers == 0
+    assert VERIFIER.check(VERIFIER.keep(scene(0), "front"), "front", damaged, "front").inliers == 0
 
 
 def test_a_repeated_pattern_is_no_evidence():
@@ -69,9 +71,8 @@ def test_the_robots_own_body_is_no_evidence():
     valid = np.ones(one.shape[:2], bool)
     assert epipolar_check(features(one), features(other), 0.75).inliers > 30
     valid[240:] = False
-    verifier = RootSIFTVerifier()
-    kept = [verifier.keep(image, "front", valid) for image in (one, other)]
-    assert verifier.check(kept[0], "front", kept[1], "front").inliers <= 12
+    kept = [VERIFIER.keep(image, "front", valid) for image in (one, other)]
+    assert VERIFIER.check(kept[0], "front", kept[1], "front").inliers <= 12
 
 
 def test_a_thumbnail_is_small_grey_and_of_the_same_aspect():
@@ -83,8 +84,8 @@ def test_a_thumbnail_is_small_grey_and_of_the_same_aspect():
 
 @pytest.mark.parametrize("shape", [(16384, 16), (20000, 1), (1, 1), (16, 16384), (70000, 2)])
 def test_a_sliver_of_an_image_stays_small(shape):
-    """Its picture at 320 pixels width would have up to 6.4 million rows; features are looked for in at most 1280."""
+    """Its picture at 320 pixels width would have up to 6.4 million rows."""
     rgb = np.random.default_rng(0).integers(0, 256, (*shape, 3), dtype=np.uint8)
     picture = cv2.imdecode(np.frombuffer(thumbnail(rgb), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture.size <= 320 * 1280
-    assert (detect(thumbnail(rgb)).points <= 4.0).all()
+    assert (VERIFIER.features(VERIFIER.keep(rgb, "front"))[0].points <= 4.0).all()

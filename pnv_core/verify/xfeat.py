@@ -1,0 +1,142 @@
+"""XFeat (Potje et al., CVPR 2024): learned local features that hold where light and viewpoint change.
+
+The network is plain convolutions on the inference backend; its weights are Apache-2.0 (models/XFEAT.md). N features of
+an image, H x W its grey picture with sides that are multiples of 32, h x w = H / 8 x W / 8.
+"""
+
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import openvino as ov
+from numpy.typing import NDArray
+from openvino import opset15 as ops
+from safetensors.numpy import load_file
+
+from pnv_core.networks.layers import (
+    Add,
+    AvgPool,
+    Concat,
+    Conv,
+    InstanceNorm,
+    Network,
+    Relu,
+    Resize,
+    SpaceToDepth,
+    same_pads,
+)
+from pnv_core.networks.openvino_backend import Compiled, Node, build, constant, integers
+from pnv_core.verify.local_features import LocalFeatures, no_features
+
+WEIGHTS = Path(__file__).parents[1] / "models" / "xfeat.safetensors"
+_SIDE = 32  # what both sides of a picture are multiples of
+_CELL = 8
+_LEAST_SCORE = 0.05  # of a corner, the authors' detection threshold
+_NEIGHBOURHOOD = 5  # pixels, in which a corner is the surest
+_TEXTURE = 1e-3  # standard deviation of a picture in [0, 1] that shows nothing
+_EPSILON = 1e-12
+_SHAPES = 8  # graphs kept compiled, one per picture shape
+
+
+def _chain(name: str, *layers: tuple[int, ...]) -> Network:
+    """Convolutions (outputs, kernel 3, stride 1), each with a ReLU."""
+
+    def conv(number: int, outputs: int, kernel: int = 3, stride: int = 1) -> Conv:
+        return Conv(f"{name}.{number}", outputs, kernel, stride, same_pads(kernel))
+
+    return tuple(part for number, given in enumerate(layers) for part in (conv(number, *given), Relu()))
+
+
+_COARSE = (  # maps of 1 / 16 and 1 / 32, brought back to 1 / 8
+    *_chain("block4", (64, 3, 2), (64,), (64,)),
+    Add(((Resize(2),), (*_chain("block5", (128, 3, 2), (128,), (128,), (64, 1)), Resize(4)))),
+)
+_DESCRIPTORS = (
+    Add((_chain("block1", (4,), (8, 3, 2), (8,), (24, 3, 2)), (AvgPool(4, 4), Conv("skip1", 24)))),
+    *_chain("block2", (24,), (24,)),
+    *_chain("block3", (64, 3, 2), (64,), (64, 1)),
+    Add(((), _COARSE)),
+    *_chain("block_fusion", (64,), (64,)),
+    Conv("block_fusion.2", 64),
+    Concat(((), (*_chain("heatmap_head", (64, 1), (64, 1)), Conv("heatmap_head.2", 1)))),
+)
+_CORNERS = (SpaceToDepth(_CELL), *_chain("keypoint_head", (64, 1), (64, 1), (64, 1)), Conv("keypoint_head.3", 65))
+NETWORK: Network = (InstanceNorm(), Concat((_DESCRIPTORS, _CORNERS)))
+"""(1, H, W) -> (64 + 1 + 65, h, w): descriptors, log odds of their reliability, logits of the corner in each cell."""
+
+
+@lru_cache(maxsize=1)
+def _weights() -> dict[str, NDArray[np.float32]]:
+    return {name: values.astype(np.float32) for name, values in load_file(str(WEIGHTS)).items()}
+
+
+class XFeat:
+    """The network with its detection, compiled for the shapes of the pictures it meets."""
+
+    def __init__(self, width: int, most: int, threads: int = 0, precision: str = "float32") -> None:
+        """`width` pixels of a picture's longer side, at most `most` features; threads and precision as in Config."""
+        self.width, self.most = width, most
+        self._compiled = lru_cache(maxsize=_SHAPES)(lambda *shape: Compiled(lambda: _graph(*shape), threads, precision))
+
+    def features(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
+        """(h, w), optionally bool of the pixels to use -> the features, the surest first."""
+        picture = self._sized(grey)
+        if picture.std() < _TEXTURE:
+            return no_features(64)
+        corners, reliable, descriptors = self._compiled(*picture.shape)(picture[None, None])
+        rows, cols = picture.shape
+        score = corners.reshape(rows, cols)
+        if valid is not None:
+            mask = cv2.resize(valid.astype(np.uint8), (cols, rows), interpolation=cv2.INTER_NEAREST)
+            score = score * cv2.erode(mask, np.ones((9, 9), np.uint8))  # the border of the mask is no feature
+        y, x = np.nonzero(score)
+        at = np.stack([x / (cols - 1) * (cols // _CELL), y / (rows - 1) * (rows // _CELL)], 1) - 0.5
+        sure = score[y, x] * _sampled(reliable[0, 0, :, :, None], at)[:, 0]
+        best = np.argsort(-sure, kind="stable")[: self.most]
+        found = _sampled(descriptors[0], at[best])
+        found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), _EPSILON)
+        aspect = grey.shape[0] / grey.shape[1]
+        points = np.stack([(x[best] + 0.5) / cols, (y[best] + 0.5) / rows * aspect], 1)
+        return LocalFeatures(points.astype(np.float32), found)
+
+    def _sized(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """In [0, 1], the longer side `width`, the shorter within 16 pixels of what keeps the aspect."""
+        height, width = grey.shape
+        long, short = max(height, width), min(height, width)
+        other = max(_SIDE, round(self.width * short / long / _SIDE) * _SIDE)
+        size = (self.width, other) if width >= height else (other, self.width)
+        way = cv2.INTER_AREA if long > self.width else cv2.INTER_LINEAR
+        return cv2.resize(grey, size, interpolation=way) / np.float32(255)
+
+
+def _graph(rows: int, cols: int) -> ov.Model:
+    """(1, 1, H, W) -> scores of the corners (1, 1, H, W), 0 elsewhere; reliability (1, 1, h, w);
+    unit descriptors (1, h, w, 64).
+    """
+    picture = ops.parameter([1, 1, rows, cols], np.float32)
+    maps = build(NETWORK, _weights(), picture)
+    corner = _channels(ops.softmax(_channels(maps, 65, 130), 1), 0, 64)
+    heat = ops.depth_to_space(corner, "depth_first", _CELL)
+    reach = [_NEIGHBOURHOOD // 2] * 2
+    highest = ops.max_pool(heat, [1, 1], [1, 1], reach, reach, [_NEIGHBOURHOOD] * 2).output(0)
+    peak = ops.logical_and(ops.equal(heat, highest), ops.greater(heat, constant(_LEAST_SCORE)))
+    scores = ops.select(peak, heat, constant(0.0))
+    descriptors = ops.normalize_l2(_channels(maps, 0, 64), integers(1), _EPSILON**2, "max")
+    outputs = [scores, ops.sigmoid(_channels(maps, 64, 65)), ops.transpose(descriptors, integers(0, 2, 3, 1))]
+    return ov.Model(outputs, [picture], "xfeat")
+
+
+def _channels(x: Node, first: int, end: int) -> Node:
+    return ops.slice(x, integers(first), integers(end), integers(1), integers(1))
+
+
+def _sampled(values: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Bilinear: (h, w, C) at (N, 2) cells (x, y) -> (N, C); beyond the border as at it."""
+    h, w = values.shape[:2]
+    low = np.floor(at)
+    x, y = low.astype(np.int64).T
+    right, down = ((at - low).astype(np.float32).T)[..., None]
+    x0, x1, y0, y1 = x.clip(0, w - 1), (x + 1).clip(0, w - 1), y.clip(0, h - 1), (y + 1).clip(0, h - 1)
+    upper = values[y0, x0] * (1 - right) + values[y0, x1] * right
+    return upper * (1 - down) + (values[y1, x0] * (1 - right) + values[y1, x1] * right) * down
