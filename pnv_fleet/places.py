@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pnv_core.database.patch_codes import GridLayout, buffer_bytes, encode, layout_of, layout_of_shapes, views
 from pnv_core.types import ImageRef, PlaceDescriptor
-from pnv_core.verify.feature_codes import packed, unpack
+from pnv_core.verify.feature_codes import unpack
 from pnv_core.verify.local_features import features_of
 from pnv_fleet.errors import FleetError
 
@@ -137,7 +137,7 @@ def decode_view(view: bytes, expected: tuple[GridLayout, ...] | None = None) -> 
         if codes.scales is None or not np.isfinite(codes.scales).all() or not (np.abs(codes.scales) <= 1.0).all():
             raise FleetError("a view with patch scales that are no numbers within 1")
     picture_bytes = buffer[buffer_bytes(layouts) :]
-    if packed(picture_bytes):
+    if picture_bytes.startswith(b"PNV"):  # features, here or of an older release
         try:
             unpack(picture_bytes)
         except ValueError as error:

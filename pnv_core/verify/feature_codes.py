@@ -63,7 +63,7 @@ def picture_of(kept: bytes) -> bytes:
 def _extent(kept: bytes) -> tuple[int, float, int]:
     """Features, aspect, and where the features end."""
     if len(kept) < _HEAD.size or not packed(kept):
-        raise ValueError("no packed features")
+        raise ValueError(f"packed features that begin with {kept[:4]!r}; allowed: {_MAGIC!r}")
     _, count, aspect = _HEAD.unpack_from(kept)
     end = _HEAD.size + _EACH * count
     behind = kept[end : end + 2]

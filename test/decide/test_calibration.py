@@ -181,8 +181,9 @@ def test_a_malformed_calibration_is_refused(change):
 
 def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilities_and_what_it_is_for_is_said():
     right = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"local_inliers": 3.0}), "ransac", (2, 3), (320, 240), "a test"
-    )
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"support": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        verifier="xfeat",
+    )  # fmt: skip
     evidence = [e for e, _, _ in drawn(np.random.default_rng(0), 20)]
     outcome = {"refused": 0, "said": 0, "same": 0}
 
