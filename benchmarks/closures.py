@@ -32,7 +32,7 @@ from pnv_core.verify.verifier import Verifier
 from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
-CAUTION = 1.7  # what a false candidate counts in the fit: look-alike corridors are rarer there than in buildings
+CAUTION = 1.6  # what a false candidate counts in the fit: look-alike corridors are rarer there than in buildings
 _SURE_MOTION = 24  # SIFT features on one geometry, three times what chance gives
 
 
@@ -41,7 +41,7 @@ class RememberedDescriber:
 
     def __init__(self, describer: Describer, images: TruthSequence, cache: Path) -> None:
         self.config, self.model, self.fingerprint = describer.config, describer.model, describer.fingerprint
-        self.cell = describer.cell
+        self.cell, self.grids = describer.cell, describer.grids
         self.at = 0
         self._describer = describer
         c = self.config

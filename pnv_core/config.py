@@ -132,7 +132,7 @@ class Config:
     min_texture: float = setting(0.05, "images with less texture than this close no loop", low=0.0, high=1.0, live=True)
     consistency: int = setting(3, "neighbouring keyframes that must agree; 0 = none", low=0, high=50, live=True)
     sure_score: float = setting(
-        0.9,
+        0.6,
         "a closure of at least this score needs no neighbours; above 1 = none is sure",
         low=0.0,
         high=1.1,
