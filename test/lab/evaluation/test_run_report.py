@@ -25,7 +25,8 @@ SMALL = [
 
 def run(folder: Path, *more: str) -> int:
     where = ["--images", str(folder / "images"), "--csv", str(folder / "out.csv"), "--fps", "1"]
-    return main(["run", *where, "--exclude-recent-s", "3", "--accept-score", "0.1", "--consistency", "0", *SMALL, *more])
+    accepting = ["--exclude-recent-s", "3", "--accept-score", "0.1", "--consistency", "0"]
+    return main(["run", *where, *accepting, *SMALL, *more])
 
 
 @pytest.fixture
