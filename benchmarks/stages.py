@@ -2,7 +2,7 @@
 
     python -m benchmarks.stages [--frames N] [--images DIR] [NAME=VALUE ...]
 
-Wall and processor milliseconds, medians, in one process without ROS: what the node does between taking a message and
+Wall and processor milliseconds, means, in one process without ROS: what the node does between taking a message and
 publishing. `rest` is what no stage has: keyframe selection, and what is kept for local features. The last column is the
 time that the stage's multiplications and additions would take at the rate of a large product in the same run.
 """
@@ -26,10 +26,10 @@ from pnv_core.config import Config
 from pnv_core.describe.describer import resized, texture
 from pnv_core.timing import StageTimer
 
-_STAGES = ("retrieve", "rerank")
+_STAGES = ("retrieve", "rerank")  # the latter with local features
 
 
-def medians(functions: dict[str, Callable[[int], Any]], frames: int) -> dict[str, tuple[float, float]]:
+def means(functions: dict[str, Callable[[int], Any]], frames: int) -> dict[str, tuple[float, float]]:
     """Wall and processor milliseconds of each, in turns."""
     taken: dict[str, list[tuple[float, float]]] = {name: [] for name in functions}
     for number in range(-3, frames):
@@ -39,7 +39,7 @@ def medians(functions: dict[str, Callable[[int], Any]], frames: int) -> dict[str
             spent = time.perf_counter() - wall, time.process_time() - cpu
             if number >= 0:
                 taken[name].append(spent)
-    return {name: tuple(1e3 * np.median(times, axis=0)) for name, times in taken.items()}  # type: ignore[misc]
+    return {name: tuple(1e3 * np.mean(times, axis=0)) for name, times in taken.items()}  # type: ignore[misc]
 
 
 def main() -> None:
@@ -67,7 +67,7 @@ def main() -> None:
         recognizer.keyframes.forget()
         recognizer.process(message_to_frame(raw[number % len(raw)], "0"))
 
-    found = medians(
+    found = means(
         {
             "decode raw": lambda i: message_to_frame(raw[i % len(raw)], "0"),
             "decode JPEG": lambda i: message_to_frame(jpeg[i % len(jpeg)], "0", recognizer.enough),
@@ -80,7 +80,7 @@ def main() -> None:
         args.frames,
     )
     for stage in _STAGES:
-        found[stage] = tuple(1e3 * float(np.median(timers[c].durations[stage])) for c in ("wall", "cpu"))  # type: ignore
+        found[stage] = tuple(1e3 * float(np.mean(timers[c].durations[stage])) for c in ("wall", "cpu"))  # type: ignore
     parts = ("decode raw", "resize", "network", "texture", *_STAGES)
     whole = found["whole frame, raw"]
     found["rest"] = tuple(whole[i] - sum(found[p][i] for p in parts) for i in (0, 1))  # type: ignore[assignment]
