@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 import pnv_core.openmp  # noqa: F401 - before torch is loaded  # isort: skip
@@ -40,6 +41,7 @@ from pnv_core.networks.layers import Add, Block, Concat, Conv, Network, Shape, s
 from pnv_core.networks.openvino_backend import Compiled, build, fast_precisions, image_input
 from pnv_core.threads import workers
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.homography import homography_inliers
 from pnv_core.verify.reranker import Reranker
 
 SIZES, WEIGHTS = (2, 5, 8), (0.45, 0.15, 0.4)
@@ -187,6 +189,20 @@ def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: 
     return compared(f"re-ranking {candidates} candidates, sizes 2, 5, 8, {scorer}, D={dim}", sides, rounds)
 
 
+def homography_row(share: float, rounds: int, matches: int = 140) -> dict[str, Any]:
+    """OpenCV's RANSAC and ours on matches of a grid, a share of which are shifted alike and the others random."""
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(23), np.arange(17)), -1).reshape(-1, 2) * 16 + 15.5
+    source, target = (grid[rng.permutation(len(grid))[:matches]].astype(np.float32) for _ in range(2))
+    agreeing = int(share * matches)
+    target[:agreeing] = source[:agreeing] + np.float32([16, 0])
+    sides: dict[str, Callable[[], Any]] = {
+        "baseline": lambda: cv2.findHomography(source, target, cv2.RANSAC, 24.0),
+        "product": lambda: homography_inliers(source, target, 24.0),
+    }
+    return compared(f"homography of {matches} matches, {share:g} of them inliers", sides, rounds)
+
+
 def gflop(network: Network, shape: Shape) -> float:
     """Multiplications and additions of the convolutions for an image of (channels, height, width)."""
     total = 0.0
@@ -318,6 +334,7 @@ def main() -> int:
         rows = [patches_row(k, d, args.threads, args.rounds) for k, d in settings]
         count = 10 if args.quick else 100
         rows.append(reranking_row(512, "rapid", count, args.threads, 1 if args.quick else args.rounds))
+        rows += [homography_row(share, 5 * args.rounds) for share in (0.0, 0.2, 0.4, 0.6, 0.8)]
         for scorer in ("ransac", "usac"):
             rows.append(reranking_row(128, scorer, count, args.threads, 1 if args.quick else args.rounds))
         rows.append(trunk_row("lite trunk", lite_trunk(0, deep=True), (288, 384), args.threads, 5 * args.rounds))
