@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from pnv_cli.common import writable
 from pnv_core.errors import ConfigError
 
+KINDS = ("closures", "pairs", "tum", "g2o", "rtabmap")  # of pnv_core.pose.export, which takes time to import
+
 if TYPE_CHECKING:
     from pnv_core.maps.manifest import Manifest
 
@@ -31,10 +33,15 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     merge.add_argument("second", type=Path)
     _output(merge, "the new map")
 
-    export = _action(actions, "export", _export, "keyframes as a table (.csv) or arrays (.npz)")
+    export = _action(
+        actions, "export", _export, "keyframes, closures and poses for other programs"
+    )
     export.add_argument("map", type=Path)
-    _output(export, "a .csv or .npz file")
+    _output(export, "a .csv or .npz file, or of --kind")
     export.add_argument("--patches", action="store_true", help="patch descriptors too (.npz)")
+    export.add_argument("--kind", choices=KINDS, help="of --poses: tum, g2o, rtabmap; of --closures: closures, pairs")
+    export.add_argument("--poses", type=Path, help="csv, TUM or EuRoC: where the keyframes were taken, found by stamp")
+    export.add_argument("--closures", type=Path, metavar="CSV", help="closures between keyframes, as pnv run --csv")
 
     prune = _action(actions, "prune", _prune, "a smaller map: without some sessions, or thinned out")
     prune.add_argument("map", type=Path)
@@ -110,6 +117,8 @@ def _export(args: argparse.Namespace) -> int:
     from pnv_core.maps import tools
 
     output = writable(args.output)
+    if args.kind:
+        return _exported(args, output)
     if output.suffix == ".csv" and not args.patches:
         rows = tools.export_csv(args.map, output)
     elif output.suffix == ".npz":
@@ -117,6 +126,36 @@ def _export(args: argparse.Namespace) -> int:
     else:
         raise ConfigError(f"--output {output} given; allowed: a .csv (without --patches) or .npz file")
     print(f"{output}: {rows} keyframes")
+    return 0
+
+
+def _exported(args: argparse.Namespace, output: Path) -> int:
+    """A file of one of the kinds that pnv run writes too."""
+    from pnv_core.files import atomic_write
+    from pnv_core.maps.exports import closures_of, refs_of
+    from pnv_core.pose.export import OF_POSES, GraphPose, exported
+    from pnv_lab.poses import read_poses
+
+    needed = "--poses" if args.kind in OF_POSES else "--closures"
+    if getattr(args, needed[2:]) is None:
+        raise ConfigError(f"--kind {args.kind} given; allowed: together with {needed} FILE")
+    refs, nodes = refs_of(args.map), {}
+    closures, names = closures_of(args.closures, refs) if args.closures else ([], {})
+    if args.kind in OF_POSES:
+        poses = read_poses(args.poses)
+        if poses.quaternions is None:
+            raise ConfigError(f"{args.poses}: has no orientations; allowed: yaw, or qx, qy, qz, qw")
+        frames = {ref: (names.get(ref.id, ""), ref.stamp_ns) for ref in refs}
+        rows = poses.of_frames(frames.values())
+        nodes = {
+            ref: GraphPose(poses.positions[rows[frame]], poses.quaternions[rows[frame]])
+            for ref, frame in frames.items()
+            if frame in rows
+        }
+    text = exported(args.kind, nodes, [(c, None) for c in closures], lambda ref: names.get(ref.id, f"{ref.stamp_ns}"))
+    with atomic_write(output) as file:
+        file.write(text.encode())
+    print(f"{output}: {len(nodes) or len(refs)} keyframes, {len(closures)} closures")
     return 0
 
 

@@ -36,7 +36,7 @@ COLUMNS = (
     "accepted",
     "reason",
 )
-_FILES = ("csv", "report", "rrd", "pairs", "g2o", "tum")  # flags that name a file to write
+_FILES = ("csv", "report", "rrd", "pairs", "g2o", "tum", "rtabmap")  # flags that name a file to write
 _SHOWN = (*ALWAYS_SHOWN, "accept_score", "exclude_recent_s", "min_interval_s", "candidates")
 
 
@@ -56,6 +56,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> None:
     out.add_argument("--pairs", metavar="FILE", help="accepted closures as image pairs, in hloc's format")
     out.add_argument("--g2o", metavar="FILE", help="pose graph of --poses and closures; with --intrinsics their poses")
     out.add_argument("--tum", metavar="FILE", help="poses of the keyframes as a TUM trajectory")
+    out.add_argument("--rtabmap", metavar="FILE.graph", help="as --g2o, in TORO's format, which RTAB-Map reads")
     out.add_argument("--timing", action="store_true", help="print the time of each stage")
     given = parser.add_argument_group("what is known")
     given.add_argument(
@@ -83,6 +84,7 @@ class Targets:
     pairs: Path | None
     g2o: Path | None
     tum: Path | None
+    rtabmap: Path | None
     map: Path | None
 
 
@@ -119,8 +121,8 @@ def run(args: argparse.Namespace) -> int:
             _record_path(recording, found, truth)
     _export(targets, recognizer, found, poses, _cameras(args, found))
     _save_map(targets, recognizer)
-    written = (targets.csv, targets.report, targets.rrd, targets.pairs, targets.g2o, targets.tum, targets.map)
-    print(f"  {'written':<9}{', '.join(str(path) for path in written if path)}")
+    written = [path for name in (*_FILES, "map") if (path := getattr(targets, name))]
+    print(f"  {'written':<9}{', '.join(map(str, written))}")
     return 0
 
 
@@ -213,7 +215,7 @@ class Names:
 
 def _targets(args: argparse.Namespace) -> Targets:
     """Where the flags want what. Raises ConfigError for a place that cannot be written, before any work."""
-    alone = [args.csv, args.report, args.rrd, args.pairs, args.g2o, args.tum]
+    alone = [getattr(args, name) for name in _FILES]
     folder = Path(args.out) if args.out else None
     if folder is None and not any(alone):
         stem = Path(named_source(args)[1]).resolve()
@@ -221,8 +223,8 @@ def _targets(args: argparse.Namespace) -> Targets:
         folder = Path("out") / f"{name}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if folder and folder.exists() and not folder.is_dir():
         raise ConfigError(f"--out {folder}: is a file; allowed: a folder")
-    if (args.g2o or args.tum) and not args.poses:
-        raise ConfigError("--g2o and --tum write poses; allowed: together with --poses FILE")
+    if (args.g2o or args.tum or args.rtabmap) and not args.poses:
+        raise ConfigError("--g2o, --rtabmap and --tum write poses; allowed: together with --poses FILE")
     if not (args.radius_m > 0 and args.angle_deg > 0):
         raise ConfigError(f"--radius-m {args.radius_m:g} --angle-deg {args.angle_deg:g}; allowed: more than 0")
     if args.localize and not args.load_map:
@@ -268,8 +270,8 @@ def _poses(args: argparse.Namespace) -> "Poses | None":
     from pnv_lab.poses import read_poses
 
     poses = read_poses(args.poses)
-    if (args.g2o or args.tum) and poses.quaternions is None:
-        raise ConfigError(f"{args.poses}: has no orientations; allowed for --g2o and --tum: yaw, or qx, qy, qz, qw")
+    if (args.g2o or args.tum or args.rtabmap) and poses.quaternions is None:
+        raise ConfigError(f"{args.poses}: has no orientations; allowed for the graph: yaw, or qx, qy, qz, qw")
     return poses
 
 
@@ -344,14 +346,14 @@ def _export(
 ) -> None:
     """The accepted closures, and the poses of the keyframes, for other programs."""
     from pnv_core.files import atomic_write
-    from pnv_core.pose.export import GraphPose, graph_to_g2o, pairs_to_hloc, poses_to_tum
+    from pnv_core.pose.export import OF_POSES, GraphPose, exported
     from pnv_core.pose.relative_poses import RelativePoses
 
-    names, accepted = found.names, found.accepted
-    texts: dict[Path, str] = {}
-    if targets.pairs:
-        texts[targets.pairs] = pairs_to_hloc([(names.of(c.query), names.of(c.match)) for c in accepted])
-    if poses is not None and poses.quaternions is not None and (targets.tum or targets.g2o):
+    names = found.names
+    asked = {kind: path for kind in ("pairs", *OF_POSES) if (path := getattr(targets, kind))}
+    nodes: dict[ImageRef, GraphPose] = {}
+    closures: list[Any] = [(c, None) for c in found.accepted]
+    if poses is not None and poses.quaternions is not None and asked.keys() & set(OF_POSES):
         rows = poses.of_frames(names.frames())
         nodes = {
             ref: GraphPose(poses.positions[row], poses.quaternions[row])
@@ -359,16 +361,14 @@ def _export(
             if ref.session == recognizer.database.session
             and (row := rows.get((names.of(ref), ref.stamp_ns))) is not None
         }
-        if targets.tum:
-            texts[targets.tum] = poses_to_tum({ref.stamp_ns: pose for ref, pose in nodes.items()})
-        if targets.g2o:
-            for ref, pose in sorted(nodes.items(), key=lambda node: node[0].stamp_ns):
-                x, y, z = map(float, pose.position)
-                recognizer.odometry.add(ref.stamp_ns, x, y, z)  # the run decided without it
-            measured = RelativePoses(recognizer, cameras)
-            closures = [(c, measured.estimate(c)) for c in accepted]
-            texts[targets.g2o] = graph_to_g2o({ref.id: pose for ref, pose in nodes.items()}, closures)
-    for path, text in texts.items():
+    if asked.keys() & {"g2o", "rtabmap"}:
+        for ref, pose in sorted(nodes.items(), key=lambda node: node[0].stamp_ns):
+            x, y, z = map(float, pose.position)
+            recognizer.odometry.add(ref.stamp_ns, x, y, z)  # the run decided without it
+        measured = RelativePoses(recognizer, cameras)
+        closures = [(c, measured.estimate(c)) for c in found.accepted]
+    for kind, path in asked.items():
+        text = exported(kind, nodes, closures, names.of)
         with atomic_write(path) as file:
             file.write(text.encode())
 

@@ -1,9 +1,10 @@
-"""Closures and poses for offline tools: CSV, g2o pose graphs, TUM trajectories, image pairs."""
+"""Closures and poses for offline tools: CSV, g2o and RTAB-Map pose graphs, TUM trajectories, image pairs."""
 
 import csv
 import io
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from pnv_core.errors import PnvError
 from pnv_core.pose.geometry import RelativePose
 from pnv_core.rotations import local_covariance, matrix_of, quaternion_of
-from pnv_core.types import LoopClosure
+from pnv_core.types import ImageRef, LoopClosure
 
 Array = NDArray[np.float64]
 
@@ -80,22 +81,89 @@ def graph_to_g2o(
     no nodes are left out.
     """
     lines = [f"VERTEX_SE3:QUAT {i} {_numbers(n.position)} {_numbers(n.quaternion)}" for i, n in sorted(nodes.items())]
-    order = sorted(nodes)
-    information = np.diag([odometry_sigma[0] ** -2] * 3 + [odometry_sigma[1] ** -2] * 3)
-    for a, b in itertools.pairwise(order):
-        rotation = matrix_of(nodes[a].quaternion)
-        position = rotation.T @ (np.asarray(nodes[b].position) - nodes[a].position)
-        lines.append(_edge(a, b, position, quaternion_of(rotation.T @ matrix_of(nodes[b].quaternion)), information))
+    lines += [_edge(*edge) for edge in _odometry_edges(nodes, odometry_sigma)]
     for closure, pose in closures:
         a, b = closure.match.id, closure.query.id
-        if a not in nodes or b not in nodes:
-            continue
-        if pose is None or not pose.metric:
-            lines.append(f"# closure {a} {b} score {closure.score:.6f} without scale")
-        else:
-            information = np.linalg.inv(local_covariance(pose.covariance, pose.matrix)).astype(np.float64)
-            lines.append(_edge(a, b, pose.translation, pose.quaternion, information))
+        if a in nodes and b in nodes:
+            edge = _closure_edge(closure, pose)
+            lines.append(_edge(*edge) if edge else f"# closure {a} {b} score {closure.score:.6f} without scale")
     return "\n".join(lines) + "\n"
+
+
+def graph_to_toro(
+    nodes: Mapping[int, GraphPose],
+    closures: Sequence[tuple[LoopClosure, RelativePose | None]],
+    odometry_sigma: tuple[float, float] = (0.05, 0.01),
+) -> str:
+    """The same graph in TORO's format, which RTAB-Map reads (corelib/src/optimizer/OptimizerTORO.cpp, loadGraph).
+
+    Its reader takes lines of VERTEX3 (8 words) and EDGE3 (30 words) only, optimises ids above 0, so they are counted on
+    by one, and reads the information of roll, pitch, yaw before that of x, y, z. It has no comments: a closure without
+    scale is left out.
+    """
+    lines = [f"VERTEX3 {i + 1} {_euler_pose(n.position, n.quaternion)}" for i, n in sorted(nodes.items())]
+    measured = [_closure_edge(c, pose) for c, pose in closures if c.match.id in nodes and c.query.id in nodes]
+    for a, b, position, quaternion, information in (*_odometry_edges(nodes, odometry_sigma), *filter(None, measured)):
+        order = [3, 4, 5, 0, 1, 2]
+        upper = information[np.ix_(order, order)][np.triu_indices(6)]
+        lines.append(f"EDGE3 {a + 1} {b + 1} {_euler_pose(position, quaternion)} {_short(upper)}")
+    return "".join(line + "\n" for line in lines)
+
+
+def exported(
+    kind: str,
+    nodes: Mapping[ImageRef, GraphPose],
+    closures: Sequence[tuple[LoopClosure, RelativePose | None]],
+    name: Callable[[ImageRef], str],
+) -> str:
+    """The text of a file of one of `KINDS`, the same for every command; `name` is what an image is called.
+
+    Raises PnvError for names that a pairs file cannot hold.
+    """
+    by_id = {ref.id: pose for ref, pose in nodes.items()}
+    return {
+        "closures": lambda: closures_to_csv([c for c, _ in closures]),
+        "pairs": lambda: pairs_to_hloc([(name(c.query), name(c.match)) for c, _ in closures]),
+        "tum": lambda: poses_to_tum({ref.stamp_ns: pose for ref, pose in nodes.items()}),
+        "g2o": lambda: graph_to_g2o(by_id, closures),
+        "rtabmap": lambda: graph_to_toro(by_id, closures),
+    }[kind]()
+
+
+KINDS = ("closures", "pairs", "tum", "g2o", "rtabmap")
+OF_POSES = ("tum", "g2o", "rtabmap")  # those that are nothing without poses
+
+_Edge = tuple[int, int, Array, Array, Array]  # from, to, position, quaternion, information with position first
+
+
+def _odometry_edges(nodes: Mapping[int, GraphPose], sigma: tuple[float, float]) -> list[_Edge]:
+    information = np.diag([sigma[0] ** -2] * 3 + [sigma[1] ** -2] * 3)
+    edges = []
+    for a, b in itertools.pairwise(sorted(nodes)):
+        rotation = matrix_of(nodes[a].quaternion)
+        position = rotation.T @ (np.asarray(nodes[b].position) - nodes[a].position)
+        edges.append((a, b, position, quaternion_of(rotation.T @ matrix_of(nodes[b].quaternion)), information))
+    return edges
+
+
+def _closure_edge(closure: LoopClosure, pose: RelativePose | None) -> _Edge | None:
+    """None without scale."""
+    if pose is None or not pose.metric:
+        return None
+    information = np.linalg.inv(local_covariance(pose.covariance, pose.matrix)).astype(np.float64)
+    return closure.match.id, closure.query.id, pose.translation, pose.quaternion, information
+
+
+def _euler_pose(position: Array, quaternion: Array) -> str:
+    """x y z roll pitch yaw, rotations about the fixed axes x, y, z."""
+    r = matrix_of(quaternion)
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    return _short([*position, math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
+
+
+def _short(values: Sequence[float] | Array) -> str:
+    """Fewer digits: RTAB-Map reads lines of at most 400 characters."""
+    return " ".join(f"{float(v) + 0.0:.6g}" for v in values)
 
 
 def pose_graph_to_g2o(poses: Array, edges: Sequence[tuple[int, int, Array, Array]]) -> str:

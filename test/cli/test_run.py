@@ -132,6 +132,27 @@ def test_a_pose_graph_has_a_node_for_every_keyframe(walk, model):
     assert any(line.startswith("# closure 0 5 ") for line in lines)
 
 
+def test_a_map_gives_what_its_run_gave_other_programs(walk, model, capsys):
+    flags = ["--g2o", "g.g2o", "--tum", "t.tum", "--rtabmap", "r.graph", "--pairs", "p.txt", "--csv", "c.csv"]
+    assert main(["run", "walk/images", "--poses", "way.tum", "--save-map", "m", *flags, *model, *SURE]) == 0
+    for kind, path in (("g2o", "g.g2o"), ("tum", "t.tum"), ("rtabmap", "r.graph"), ("pairs", "p.txt")):
+        beside = ["--poses", "way.tum", "--closures", "c.csv", "--kind", kind]
+        assert main(["map", "export", "m", "-o", f"m.{kind}", *beside]) == 0
+        ours, theirs = ((walk / name).read_text().splitlines() for name in (f"m.{kind}", path))
+        assert [line.split(" score")[0] for line in ours] == [line.split(" score")[0] for line in theirs]
+    lines = [line.split() for line in (walk / "r.graph").read_text().splitlines()]
+    assert [len(words) for words in lines] == [8] * 7 + [30] * 6  # as RTAB-Map's reader counts them
+    assert all(len(" ".join(words)) < 400 for words in lines)
+    np.testing.assert_allclose([[float(v) for v in words[2:4]] for words in lines[:7]], WAY, atol=1e-5)
+    assert lines[0][1] == "1"
+    np.testing.assert_allclose(float(lines[0][7]), 0.5, atol=1e-4)  # yaw, of qz = 0.247404
+    assert main(["map", "export", "m", "-o", "x", "--kind", "g2o"]) == 2
+    assert "--kind g2o given; allowed: together with --poses FILE" in capsys.readouterr().err
+    (walk / "bad.csv").write_text("query_stamp,match_stamp\n1,x\n")
+    assert main(["map", "export", "m", "-o", "x", "--kind", "pairs", "--closures", "bad.csv"]) == 2
+    assert "bad.csv: line 2" in capsys.readouterr().err
+
+
 def test_a_map_of_monday_localises_the_run_of_tuesday(walk, model, capsys):
     assert main(["run", "walk/images", "--save-map", "m", "--csv", "c.csv", *model, *SURE]) == 0
     assert main(["run", "walk/images", "--load-map", "m", "--localize", "--out", "o", *model, *SURE]) == 0
