@@ -33,9 +33,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     merge.add_argument("second", type=Path)
     _output(merge, "the new map")
 
-    export = _action(
-        actions, "export", _export, "keyframes, closures and poses for other programs"
-    )
+    export = _action(actions, "export", _export, "keyframes, closures and poses for other programs")
     export.add_argument("map", type=Path)
     _output(export, "a .csv or .npz file, or of --kind")
     export.add_argument("--patches", action="store_true", help="patch descriptors too (.npz)")

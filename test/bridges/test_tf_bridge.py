@@ -95,6 +95,61 @@ def test_jumps_bad_covariances_and_foreign_messages_are_said_and_survived(listen
         assert "Traceback" not in bridge.output
 
 
+def test_either_side_may_be_restarted(listener):
+    from tf2_msgs.msg import TFMessage
+
+    _, odometry = laps(90)
+    sent = listener.node.create_publisher(Odometry, "/odom", 500)
+    transforms = listener.collect(TFMessage, "/tf", 500)
+    recogniser = Process(sys.executable, "-c", SAYS_AGAIN)  # as place_recognizer does, it keeps what it said
+    try:
+        recogniser.wait_for("said")
+        with running("tf_bridge", READY) as bridge:
+            wait_until(sent.get_subscription_count, 20, "the bridge")
+            for i in range(40):
+                sent.publish(odometry_message(i * S, odometry[i]))
+            wait_until(lambda: len(transforms) >= 40, 20, "transforms")
+            bridge.child.kill()
+            bridge.wait()
+        assert recogniser.child.poll() is None
+        wait_until(lambda: not sent.get_subscription_count(), 60, "the killed bridge to be gone")
+        with running("tf_bridge", READY) as bridge:
+            wait_until(sent.get_subscription_count, 20, "the bridge that came back")
+            for i in range(40, 60):
+                sent.publish(odometry_message(i * S, odometry[i]))
+            bridge.wait_for("loop closure 30.000 - 5.000 dropped: no odometry at the query and match")
+            wait_until(lambda: len(transforms) >= 60, 20, "transforms again")
+            recogniser.end(signal.SIGKILL)
+            restarted = Recogniser(listener)
+            restarted.say(closure(58 * S, 42 * S), None)
+            for i in range(60, 64):
+                sent.publish(odometry_message(i * S, odometry[i]))
+            wait_until(lambda: len(transforms) >= 64, 20, "transforms after the recogniser was restarted")
+            assert bridge.end(signal.SIGINT) == 0
+        assert "Traceback" not in bridge.output
+        assert "0 of 1 closures in the solution (1 unsupported)" in bridge.output
+    finally:
+        if recogniser.child.poll() is None:
+            recogniser.end(signal.SIGKILL)
+    stamps = [stamp_of(message.transforms[0]) for message in transforms]
+    assert stamps == sorted(set(stamps))
+
+
+SAYS_AGAIN = """
+import time, rclpy
+from std_msgs.msg import Float64MultiArray
+from msg_adapters.loop_closures import closures_to_message
+from pnv_ros.outputs import CLOSURES_QOS
+from test.bridges.running import S, closure
+rclpy.init()
+node = rclpy.create_node("place_recognizer")
+publisher = node.create_publisher(Float64MultiArray, "/loop_closures", CLOSURES_QOS)
+publisher.publish(closures_to_message([closure(30 * S, 5 * S)], ["c"]))
+print("said", flush=True)
+rclpy.spin(node)
+"""
+
+
 @pytest.mark.parametrize(
     ("parameters", "missing", "words"),
     [

@@ -58,19 +58,23 @@ def main() -> int:
                 rows.append(sample(node, health, began, place))
                 writer.writerow([f"{value:.2f}" for value in rows[-1]])
                 table.flush()
-            status = node.end()
+            _plot(rows, args.output)
+            status = node.end(timeout=300.0)
         listener.close()
-    figure, axes = plt.subplots(len(FIELDS) - 1, 1, sharex=True, figsize=(8, 14))
-    for axis, name, values in zip(axes, FIELDS[1:], list(zip(*rows, strict=True))[1:], strict=True):
-        axis.plot([row[0] for row in rows], values)
-        axis.set_ylabel(name, fontsize=8)
-    axes[-1].set_xlabel(FIELDS[0])
-    figure.savefig(args.output)
     print(", ".join(FIELDS))
     for at in range(5):
         print(", ".join(f"{value:.1f}" for value in rows[(len(rows) - 1) * at // 4]))
     print(f"exit status {status}; {args.output}")
     return status
+
+
+def _plot(rows: list[tuple[float, ...]], output: Path) -> None:
+    figure, axes = plt.subplots(len(FIELDS) - 1, 1, sharex=True, figsize=(8, 14))
+    for axis, name, values in zip(axes, FIELDS[1:], list(zip(*rows, strict=True))[1:], strict=True):
+        axis.plot([row[0] for row in rows], values)
+        axis.set_ylabel(name, fontsize=8)
+    axes[-1].set_xlabel(FIELDS[0])
+    figure.savefig(output)
 
 
 if __name__ == "__main__":
