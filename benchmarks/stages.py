@@ -3,7 +3,7 @@
     python -m benchmarks.stages [--frames N] [--images DIR] [NAME=VALUE ...]
 
 Wall and processor milliseconds, means, in one process without ROS: what the node does between taking a message and
-publishing. `rest` is what no stage has: keyframe selection, and what is kept for local features. The last column is the
+publishing. `rest` is what no stage has: keyframe selection, consistency. The last column is the
 time that the stage's multiplications and additions would take at the rate of a large product in the same run.
 """
 
@@ -26,7 +26,7 @@ from pnv_core.config import Config
 from pnv_core.describe.describer import resized, texture
 from pnv_core.timing import StageTimer
 
-_STAGES = ("retrieve", "rerank")  # the latter with local features
+_STAGES = ("features", "retrieve", "rerank")  # rerank compares the features, too
 
 
 def means(functions: dict[str, Callable[[int], Any]], frames: int) -> dict[str, tuple[float, float]]:
@@ -79,9 +79,9 @@ def main() -> None:
         },
         args.frames,
     )
-    for stage in _STAGES:
+    for stage in (s for s in _STAGES if s in timers["cpu"].durations):
         found[stage] = tuple(1e3 * float(np.mean(timers[c].durations[stage])) for c in ("wall", "cpu"))  # type: ignore
-    parts = ("decode raw", "resize", "network", "texture", *_STAGES)
+    parts = ("decode raw", "resize", "network", "texture", *(s for s in _STAGES if s in found))
     whole = found["whole frame, raw"]
     found["rest"] = tuple(whole[i] - sum(found[p][i] for p in parts) for i in (0, 1))  # type: ignore[assignment]
     peak = roofline(config.threads or 1)["float32_gflops"]

@@ -68,8 +68,9 @@ class PlaceRecognizer:
         predecessor = self.keyframes.similarity(frame, descriptor)
         self.keyframes.take(frame, descriptor)
         if self.config.verify:
-            kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
-            descriptor = replace(descriptor, thumbnail=kept, geometry=self.geometry_of(frame, kept))
+            with self.timer.stage("features"):
+                kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
+                descriptor = replace(descriptor, thumbnail=kept, geometry=self.geometry_of(frame, kept))
         with self.timer.stage("retrieve"):
             recent_ns = int(self.config.exclude_recent_s * 1e9)
             candidates = self.database.nearest(
