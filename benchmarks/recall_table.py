@@ -29,7 +29,7 @@ from pnv_core.describe.netvlad import NetVLAD, gem
 from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.describe.trunks.rootsift import rootsift_trunk
 from pnv_core.types import ImageRef, PlaceDescriptor
-from pnv_lab.fit import FitOptions, adapt_model, as_batch, image_files, neighbours, read_rgb, vocabulary_of
+from pnv_lab.fit import FitOptions, adapt_model, as_batch, image_files, read_rgb, vocabulary_of
 from pnv_lab.training.initial import imagenet_trunk
 from pnv_lab.training.sources import is_held, load_set
 from pnv_lab.training.validation import synthetic_queries
@@ -211,7 +211,7 @@ def with_fitted(describer: Describer, known: RecallSet) -> list[tuple[str, list[
     files = [image for image in known.references if isinstance(image, Path)]
     if len(files) < len(known.references):
         return []
-    model = adapt_model(TorchModel.of(describer.model), files, neighbours(files)).model()
+    model = adapt_model(TorchModel.of(describer.model), files).model()
     fitted = Describer(model, describer.config)
     vectors = [
         np.stack([fitted.describe(pixels(image, fitted.image_size)).global_vector for image in part])

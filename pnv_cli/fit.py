@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from pnv_core.describe.model_files import ModelInfo, load_model, save_model
     from pnv_core.describe.torch_model import TorchModel, TorchTrunk
     from pnv_core.describe.trunks import TRUNKS
-    from pnv_lab.fit import adapt_model, fit_model, image_files, neighbours, neighbours_by_pose
+    from pnv_lab.fit import adapt_model, fit_model, image_files
     from pnv_lab.poses import read_poses
 
     output = writable(args.output)
@@ -85,8 +85,7 @@ def run(args: argparse.Namespace) -> int:
         assert base is not None
         adapted = TorchModel.of(base)
         adapted.trunk.to(args.device)
-        pairs = neighbours_by_pose(files, read_poses(args.poses)) if args.poses else neighbours(files)
-        model = adapt_model(adapted, files, pairs, _bar)
+        model = adapt_model(adapted, files, read_poses(args.poses) if args.poses else None, _bar)
     what = "vocabulary and projections fitted" if anew else "global projection adapted"
     source = (args.trunk if base is None else base.info.provenance or base.info.trunk).strip()
     provenance = f"{what} to {len(files)} images by pnv fit; before: {source}"

@@ -22,8 +22,10 @@ from pnv_core.errors import ModelError
 from pnv_core.images import SUFFIXES, read_image
 from pnv_lab.poses import Poses
 
-SHRINKAGE = 0.8  # of the whitening that adapts a trained projection; less of it forgets what training learned
+SHRINKAGE = 0.8  # of the whitening that adapts a trained projection, at least; less of it forgets what training learned
+LOOK_ALIKES = 5  # images most like it, among which an image's pair by name must be: pictures in no order make none
 SAME_M, SAME_DEG = 1.0, 20.0  # between two looks at one place
+_LEAST_PAIRS = 8
 NEIGHBOURS = 3  # that an image is paired with, at most
 SAMPLES_PER_DIMENSION = 4  # images a whitened principal direction is estimated from; with fewer it is mostly noise
 Progress = Callable[[Iterable[Path], str], Iterable[Path]]
@@ -264,15 +266,22 @@ def neighbours_by_pose(files: Sequence[Path], poses: Poses) -> Tensor:
     return torch.tensor(sorted(pairs), dtype=torch.long)
 
 
+def alike(pairs: Tensor, vectors: Tensor, most: int = LOOK_ALIKES) -> Tensor:
+    """Those of the pairs (P, 2) whose unit vectors (M, D) are each among the `most` nearest of the other's."""
+    similarity = vectors @ vectors.T
+    nearest = similarity.fill_diagonal_(-1).topk(min(most, len(vectors) - 1), dim=1).indices  # (M, most)
+    first, second = pairs.T
+    mutual = (nearest[first] == second[:, None]).any(1) & (nearest[second] == first[:, None]).any(1)
+    return pairs[mutual]
+
+
 @torch.no_grad()
-def adapted_projection(
-    projection: Projection, samples: Tensor, pairs: Tensor, shrinkage: float = SHRINKAGE
-) -> Projection:
+def adapted_projection(projection: Projection, samples: Tensor, pairs: Tensor, least: float = SHRINKAGE) -> Projection:
     """A projection that also whitens how two looks at one place differ here; D stays, and so does what is zero.
 
     samples (M, inputs), pairs (P, 2) rows of samples. The scatter within pairs, of what the projection gives, is
     shrunk towards a multiple of the identity before its inverse root is taken: learned whitening once more, from the
-    user's places, after that of the model.
+    user's places, after that of the model. It is shrunk by `least` for D pairs or more, by more for fewer.
     """
     projected = F.linear(samples, projection.weight, projection.bias)
     apart = (projected[pairs[:, 0]] - projected[pairs[:, 1]]).double()
@@ -280,7 +289,8 @@ def adapted_projection(
     level = scatter.trace() / len(scatter)
     if not level > 0:
         return projection
-    shrunk = (1 - shrinkage) * scatter / level + shrinkage * torch.eye(len(scatter), dtype=torch.float64)
+    trust = (1 - least) * min(1.0, len(pairs) / len(scatter))
+    shrunk = trust * scatter / level + (1 - trust) * torch.eye(len(scatter), dtype=torch.float64)
     values, vectors = torch.linalg.eigh(shrunk)
     whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
     return projection_of(whitening @ projection.weight, whitening @ projection.bias)
@@ -288,23 +298,29 @@ def adapted_projection(
 
 @torch.no_grad()
 def adapt_model(
-    model: TorchModel, files: Sequence[Path], pairs: Tensor, progress: Progress = plain_progress
+    model: TorchModel, files: Sequence[Path], poses: Poses | None = None, progress: Progress = plain_progress
 ) -> TorchModel:
     """The model with its global projections adapted to the images; trunk, vocabulary and patches stay as trained.
 
-    pairs (P, 2) numbers of files that show one place. Raises ModelError for fewer than eight of them.
+    Two looks at one place are near by pose, or follow one another by name and look alike. Raises ModelError for fewer
+    than eight such pairs.
     """
-    if len(pairs) < 8:
-        raise ModelError(f"{len(pairs)} pairs of images of one place are too few to adapt to; allowed: 8 or more")
+    pairs = neighbours(files) if poses is None else neighbours_by_pose(files, poses)
     options = FitOptions(image_width=model.info.image_width, image_height=model.info.image_height)
     model.trunk.eval()
-    vlads, pooled = [], []
+    rows = []
     for file in progress(files, "projection"):
         features, wide = maps_of(model.trunk, file, options)
-        vlads.append(model.netvlad(features.cpu())[0])
-        pooled.append(gem(wide.cpu())[0])
-    whole = adapted_projection(model.global_projection, torch.stack(vlads), pairs)
-    beside = model.pooled_projection and adapted_projection(model.pooled_projection, torch.stack(pooled), pairs)
+        rows.append((model.netvlad(features.cpu())[0], gem(wide.cpu())[0]))
+    vlads, pooled = (torch.stack(part) for part in zip(*rows, strict=True))
+    if poses is None:
+        pairs = alike(pairs, model.joined(vlads, pooled))
+    if len(pairs) < _LEAST_PAIRS:
+        raise ModelError(
+            f"{len(pairs)} pairs of images show one place: too few to adapt to; allowed: {_LEAST_PAIRS} or more"
+        )
+    whole = adapted_projection(model.global_projection, vlads, pairs)
+    beside = model.pooled_projection and adapted_projection(model.pooled_projection, pooled, pairs)
     return replace(model, global_projection=whole, patch_projection=model.patches_projection, pooled_projection=beside)
 
 

@@ -110,13 +110,18 @@ class TorchModel:
 
         `cells` (B, 1, h, w) say how much each cell counts.
         """
+        if self.pooled_projection is None:
+            return self.joined(vlad)
+        if cells is not None:
+            cells = F.avg_pool2d(cells, cells.shape[-1] // wide.shape[-1]).flatten(1)
+        return self.joined(vlad, gem(wide, cells))
+
+    def joined(self, vlad: Tensor, pooled: Tensor | None = None) -> Tensor:
+        """VLADs (B, K * C) and generalised means (B, E) -> unit global vectors (B, D)."""
         vector: Tensor = self.global_projection(vlad)
         if self.pooled_projection is None:
             return vector
-        share = self.info.pooled_share
-        if cells is not None:
-            cells = F.avg_pool2d(cells, cells.shape[-1] // wide.shape[-1]).flatten(1)
-        pooled = self.pooled_projection(gem(wide, cells))
+        share, pooled = self.info.pooled_share, self.pooled_projection(pooled)
         return torch.cat([vector * math.sqrt(1 - share), pooled * math.sqrt(share)], dim=1)
 
 

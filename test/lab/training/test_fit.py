@@ -13,6 +13,7 @@ from pnv_core.errors import ModelError
 from pnv_lab.fit import (
     FitOptions,
     adapted_projection,
+    alike,
     fit_model,
     image_files,
     neighbours,
@@ -78,10 +79,10 @@ def test_adapting_whitens_how_two_looks_at_a_place_differ():
     pairs = torch.arange(300)[:, None] + torch.tensor([0, 300])
     identity = Projection(6, 6)
     identity.load_state_dict({"weight": torch.eye(6), "bias": torch.ones(6)})
-    white = adapted_projection(identity, torch.cat(looks), pairs, shrinkage=0.0)
+    white = adapted_projection(identity, torch.cat(looks), pairs, least=0.0)
     apart = (looks[0] - looks[1]) @ white.weight.T
     assert torch.allclose(apart.T @ apart / 600, torch.eye(6) * (apart**2).sum() / 3600, atol=1e-3)
-    kept = adapted_projection(identity, torch.cat(looks), pairs, shrinkage=1.0)
+    kept = adapted_projection(identity, torch.cat(looks), pairs, least=1.0)
     assert torch.allclose(kept.weight, torch.eye(6), atol=1e-5)
     assert torch.allclose(kept.bias, torch.ones(6), atol=1e-5)
 
@@ -92,5 +93,7 @@ def test_pairs_follow_one_another_in_a_folder_or_are_near_by_pose(tmp_path):
     csv = tmp_path / "poses.csv"
     csv.write_text("frame,x,y,yaw\n0.png,0,0,0\n1.png,0.5,0,2\n2.png,0.6,0,0.1\n3.png,9,0,0\n")
     assert neighbours_by_pose(files, read_poses(csv)).tolist() == [[0, 2]]
+    vectors = F.normalize(torch.tensor([[1.0, 0.0], [0.9, 0.1], [0.0, 1.0], [-1.0, 0.1]]), dim=1)
+    assert alike(neighbours(files), vectors, most=1).tolist() == [[0, 1]]
     with pytest.raises(ModelError, match="within 1 m"):
         neighbours_by_pose(files[2:], read_poses(csv))
