@@ -74,6 +74,8 @@ class Trainer:
         self.model, self.batches, self.validation = model, batches, validation
         self.options = options
         self.device = torch.device(device)
+        if options.loss not in LOSSES:
+            raise ModelError(f"loss {options.loss!r} is none; allowed: {', '.join(LOSSES)}")
         if model.patch_projection is None or model.pooled_projection is None:
             raise ModelError("the model lacks a patch or a pooled projection; allowed here: a model that has both")
         self.parts = nn.ModuleDict(

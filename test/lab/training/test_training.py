@@ -77,8 +77,9 @@ def test_a_training_that_was_killed_ends_as_if_it_had_not_been(pool, imagenet_fi
     assert [row["step"] for row in resumed.journal.rows()] == [0, 2, 4, 6, 6]
 
 
-def test_training_lowers_the_loss(pool, imagenet_file, tmp_path):
-    run = trainer(pool, imagenet_file, tmp_path / "run", steps=40, save_every=10, average=0.9, patch_pairs=2)
+@pytest.mark.parametrize("loss", ["ms", "ap"])
+def test_training_lowers_the_loss(pool, imagenet_file, tmp_path, loss):
+    run = trainer(pool, imagenet_file, tmp_path / "run", steps=40, save_every=10, average=0.9, patch_pairs=2, loss=loss)
     run.run()
     losses = [row["loss"] for row in run.journal.rows() if "loss" in row]
     assert losses[-1] < losses[0]
