@@ -281,7 +281,7 @@ def adapted_projection(projection: Projection, samples: Tensor, pairs: Tensor, l
 
     samples (M, inputs), pairs (P, 2) rows of samples. The scatter within pairs, of what the projection gives, is
     shrunk towards a multiple of the identity before its inverse root is taken: learned whitening once more, from the
-    user's places, after that of the model. It is shrunk by `least` for D / 2 pairs or more, by more for fewer.
+    user's places, after that of the model. It is shrunk by `least` for D pairs or more, by more for fewer.
     """
     projected = F.linear(samples, projection.weight, projection.bias)
     apart = (projected[pairs[:, 0]] - projected[pairs[:, 1]]).double()
@@ -289,7 +289,7 @@ def adapted_projection(projection: Projection, samples: Tensor, pairs: Tensor, l
     level = scatter.trace() / len(scatter)
     if not level > 0:
         return projection
-    trust = (1 - least) * min(1.0, 2 * len(pairs) / len(scatter))
+    trust = (1 - least) * min(1.0, len(pairs) / len(scatter))
     shrunk = trust * scatter / level + (1 - trust) * torch.eye(len(scatter), dtype=torch.float64)
     values, vectors = torch.linalg.eigh(shrunk)
     whitening = (vectors * values.clamp(min=1e-6).rsqrt() @ vectors.T).float()
