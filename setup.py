@@ -70,6 +70,8 @@ SLAM = [
 
 RERUN = ["rerun-sdk>=0.24"]  # pnv run --rrd
 
+BENCHMARKS = ["nncf>=2.14", "onnx>=1.16", "onnxruntime>=1.18"]  # what benchmarks.precision compares with
+
 BRIDGES = ("tf_bridge", "rtabmap_bridge", "hydra_bridge", "swarm_slam_bridge", "lio_sam_bridge")
 
 setup(
@@ -100,6 +102,7 @@ setup(
         "fleet": FLEET,
         "docs": DOCUMENTATION,
         "rerun": RERUN,
+        "benchmarks": BENCHMARKS,
     },
     entry_points={
         "console_scripts": [

@@ -5,7 +5,7 @@
 Recall@1 by the global vector, by patches and re-ranked on the sets of benchmarks.recall_table, with queries and
 references in one precision, and with queries in another one than the map. int8: convolutions quantised by NNCF on
 training photographs. Times are those of the trunk in turns on one image; ONNX Runtime has no bfloat16 convolutions.
-Needs nncf, onnx and onnxruntime, which the product does not: pip install nncf onnx onnxruntime
+Needs nncf, onnx and onnxruntime, which the product does not: pip install 'pnv_ros[benchmarks]'
 """
 
 import argparse
