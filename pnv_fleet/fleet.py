@@ -418,6 +418,8 @@ class Fleet:
             self._store = None
 
     def _trouble(self, part: str, problem: str) -> None:
+        if self._ended.is_set():  # the outbox was closed under a thread that was left behind
+            return
         with self._changed:
             before, since = self._troubles.get(part, ("", time.time()))
             self._troubles[part] = problem, since

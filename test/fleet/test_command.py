@@ -43,6 +43,15 @@ def test_a_map_goes_up_is_queried_comes_down_and_is_forgotten(server, tmp_path, 
     assert "allowed: --robot" in capsys.readouterr().err
     assert main(["fleet", "forget", *since, *uri]) == 0
     assert "forgot 4 places, 2 are left" in capsys.readouterr().out
+    assert main(["fleet", "forget", "--session", str(1_700_000_001 * SECOND), *uri]) == 0  # no session began then
+    assert main(["fleet", "forget", "--older-than", "100", *uri]) == 0
+    assert capsys.readouterr().out.count("forgot") == 2
+    assert main(["fleet", "status", *uri]) == 0
+    assert ", 0 places" in capsys.readouterr().out
+    other = ["--image-width", "320", "--image-height", "240"]
+    assert main(["fleet", "push", str(tmp_path / "up.map"), "--robot", "alpha", *uri, *other]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "was made with model" in line
 
 
 def test_no_store_and_a_store_that_is_not_there_are_one_line(tmp_path, capsys):

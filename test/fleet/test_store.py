@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from pnv_fleet.errors import FleetError
+from pnv_fleet.maps import thin
 from pnv_fleet.places import descriptor_of, layouts_of, parts_of
 from pnv_fleet.store import Access, PlaceStore, connect
 from test.fleet.worlds import DIM, descriptor, new_model, place
@@ -60,6 +61,14 @@ def test_places_are_forgotten_by_robot_and_by_area(store):
     assert store.forget("posed == true and x > 10") == 5
     assert sorted(p.keyframe for p in store.scan()) == [1, 3, 5, 7, 9]
     assert store.forget('robot == "nobody"') == 0
+
+
+def test_places_that_newer_ones_cover_are_forgotten(store):
+    old = [place(n) for n in range(4)]
+    again = [replace(place(n + 10), vector=old[n].vector) for n in (1, 3)]  # the same two places, later
+    store.put(old + again)
+    assert thin(store, 0.95) == 2
+    assert sorted(p.keyframe for p in store.scan()) == [0, 2, 11, 13]
 
 
 def test_a_scan_gives_every_place_once(store):
