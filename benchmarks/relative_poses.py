@@ -3,10 +3,11 @@
     python -m benchmarks.relative_poses [--shared ../shared] [--sigma-depth SHARE] [NAMES]
 
 For every revisit of known pose the verifier's matches give a pose: from the images alone (direction), with depth at the
-query, with depth at the keyframe, or with the scale of odometry's way to the view before. Rendered depth is disturbed
-by `--sigma-depth` of itself. Prints a Markdown table: medians, and 90th percentiles in brackets; NEES per degree of
-freedom, whose mean is 1 for an honest covariance (of all but the worst 5 % here, where it would be 0.9), and the share
-of errors inside the covariance's 95 % region.
+query, with depth at the keyframe, or with the scale of odometry's way to the view before. Of ICL's truth only positions
+and heading are known: there rotation is the heading's error, and metres that of the length of the way. Rendered depth
+is disturbed by `--sigma-depth` of itself. Prints a Markdown table: medians, and 90th percentiles in brackets; NEES per
+degree of freedom, whose mean is 1 for an honest covariance (of all but the worst 5 % here, where it would be 0.9), and
+the share of errors inside the covariance's 95 % region.
 """
 
 import argparse
@@ -23,7 +24,7 @@ from scipy.stats import chi2
 from examples.pose_graph.sequences import icl_office
 from pnv_core.config import Config
 from pnv_core.images import read_image
-from pnv_core.pose.geometry import Intrinsics, RelativePose, depth_at, relative_pose, triangulated
+from pnv_core.pose.geometry import Intrinsics, RelativePose, depth_at, depth_by_way, relative_pose
 from pnv_core.rotations import OPTICAL_IN_BODY, angle_of, inverse, logarithm
 from pnv_core.verify.verifier import VERIFIERS, EpipolarCheck, Verifier
 from pnv_lab.worlds import Camera, loop_sequence
@@ -31,7 +32,7 @@ from pnv_lab.worlds import Camera, loop_sequence
 Array = NDArray[np.float64]
 
 _NEAR_M, _NEAR_DEG = 1.5, 30.0
-_WAYS = "direction", "depth of the query", "depth of the keyframe", "depth of both", "odometry's baseline"
+_WAYS = "direction", "depth of the query", "depth of the keyframe", "depth of both", "odometry's way"
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +46,7 @@ class Posed:
     depth: Callable[[int], NDArray[np.float32]] | None
     gap: int  # frames; a revisit is at least so much older
     every: int  # frames between queries
+    level: bool = False  # of the rotation only the heading is known
 
 
 def rendered(kind: str, seed: int) -> Posed:
@@ -65,7 +67,8 @@ def icl(folder: Path) -> Posed:
     images = sorted((folder / "images").iterdir())
     assert walk.intrinsics is not None
     camera = Intrinsics.of_pixels(*walk.intrinsics, 640)
-    return Posed("icl_office_kt3", camera, walk.truth @ OPTICAL_IN_BODY, lambda i: read_image(images[i]), None, 150, 2)
+    poses = walk.truth @ OPTICAL_IN_BODY
+    return Posed("icl_office_kt3", camera, poses, lambda i: read_image(images[i]), None, 150, 2, level=True)
 
 
 def revisits(posed: Posed) -> Iterator[tuple[int, int]]:
@@ -90,8 +93,12 @@ class Error:
     freedom: int
 
 
-def error_of(found: RelativePose, truth: Array) -> Error:
+def error_of(found: RelativePose, truth: Array, level: bool) -> Error:
+    """Of a `level` truth the heading and the length of the way are compared."""
     turn, t = logarithm(truth[:3, :3] @ found.rotation.T), truth[:3, 3]
+    if level:
+        metres = abs(float(np.linalg.norm(found.translation) - np.linalg.norm(t))) if found.metric else np.nan
+        return Error(float(np.degrees(abs(turn[1]))), np.nan, metres, np.nan, 1)
     length, direction = float(np.linalg.norm(t)), np.nan
     if found.translation.any() and length > 0:
         cosine = found.translation @ t / length / np.linalg.norm(found.translation)
@@ -131,16 +138,18 @@ def measured(posed: Posed, verifier: Verifier, sigma_depth: float) -> dict[str, 
             before -= 1
         step = inverse(posed.poses[before]) @ posed.poses[query]
         beside = check(query, before)
-        by_odometry = at_points(pair, beside, triangulated(beside, posed.camera, posed.camera, step))
+        way = float(np.linalg.norm(step[:3, 3]))
+        by_odometry = at_points(pair, beside, depth_by_way(beside, posed.camera, posed.camera, way))
         given = {
             "direction": (None, None), "depth of the query": (here, None), "depth of the keyframe": (None, there),
-            "depth of both": (here, there), "odometry's baseline": (by_odometry, None),
+            "depth of both": (here, there), "odometry's way": (by_odometry, None),
         }  # fmt: skip
         for way, (a, b) in given.items():
             if way == "direction" or a is not None or b is not None:
-                found = relative_pose(pair, posed.camera, posed.camera, a, b)
+                error = 0.1 if way == "odometry's way" else 0.0  # as RelativePoses has it
+                found = relative_pose(pair, posed.camera, posed.camera, a, b, error)
                 useful = found is not None and (found.metric or way == "direction")
-                errors[way].append(error_of(found, truth) if useful else None)
+                errors[way].append(error_of(found, truth, posed.level) if useful else None)
     return errors
 
 
@@ -164,8 +173,10 @@ def row(name: str, way: str, errors: list[Error | None]) -> str:
 
     nees = np.sort([e.nees for e in found])
     inside = np.mean([e.nees * e.freedom < chi2.ppf(0.95, e.freedom) for e in found])
+    kept = nees[: max(1, int(0.95 * len(nees)))]
+    judged = (f"{kept.mean():.2f}", f"{inside:.0%}") if np.isfinite(nees[0]) else ("", "")
     cells = [name, way, str(len(errors)), f"{len(found) / len(errors):.0%}", cell("turn", 2), cell("direction", 1),
-             cell("metres", 3), f"{nees[: max(1, int(0.95 * len(nees)))].mean():.2f}", f"{inside:.0%}"]  # fmt: skip
+             cell("metres", 3), *judged]  # fmt: skip
     return "| " + " | ".join(cells) + " |"
 
 

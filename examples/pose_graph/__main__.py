@@ -42,17 +42,22 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the odometry's drift")
     parser.add_argument("--trials", type=int, default=10, help="further drifts each walk's closures are tried with")
     parser.add_argument("--offline", action="store_true", help="no processes: the recogniser itself, every frame")
+    parser.add_argument("--depth", action="store_true", help="offline, rendered walks: every image with its depth")
     parser.add_argument("--parameter", action="append", default=[], metavar="NAME:=VALUE", help="of the node")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder of what is written; default out")
     args = parser.parse_args()
     chosen = [w for w in walks(args.data) if not args.only or any(w.name.startswith(name) for name in args.only)]
+    if args.depth:
+        if not args.offline:
+            parser.error("--depth is for --offline")
+        chosen = [w for w in chosen if w.depth is not None]
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         results = []
         for walk in chosen:
             odometry = drifted(walk.truth, walk.drift, args.seed)
             if args.offline:
-                recording = recorded(walk, odometry)
+                recording = recorded(walk, odometry, args.depth)
                 corrected = trial(walk, odometry, recording, robust=True)
             else:
                 recording, corrected = live(walk, odometry, args.parameter)
@@ -71,7 +76,7 @@ def main() -> int:
     return 0 if results and all(result.halved for result in results) else 1
 
 
-def recorded(walk: Walk, odometry: Array) -> Recording:
+def recorded(walk: Walk, odometry: Array, with_depth: bool = False) -> Recording:
     """What the recogniser says when it is given every frame, whatever time that takes: the same on any machine."""
     parser = argparse.ArgumentParser()
     add_source_flags(parser)
@@ -79,7 +84,9 @@ def recorded(walk: Walk, odometry: Array) -> Recording:
     recognizer = PlaceRecognizer(describer)
     relative, recording = RelativePoses(recognizer), Recording()
     positions = dict(zip(walk.stamps_ns, odometry[:, :3, 3], strict=True))
-    for _, frame in named_frames(parser.parse_args(walk.flags)):
+    for number, (_, frame) in enumerate(named_frames(parser.parse_args(walk.flags))):
+        if with_depth and walk.depth is not None:
+            frame = replace(frame, depth=walk.depth(number))
         recognizer.odometry.add(frame.stamp_ns, *positions[frame.stamp_ns])
         if walk.intrinsics:
             relative.cameras[frame.camera] = Intrinsics.of_pixels(*walk.intrinsics, frame.rgb.shape[1])

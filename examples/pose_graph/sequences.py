@@ -32,6 +32,7 @@ class Walk:
     noise: Noise
     parameters: dict[str, Any] = field(default_factory=dict)
     intrinsics: tuple[float, float, float, float] | None = None  # fx, fy, cx, cy in pixels, where they are known
+    depth: Callable[[int], NDArray[np.float32]] | None = None  # (h, w) metres of a frame, by its number
 
 
 def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -> Walk:
@@ -41,9 +42,12 @@ def world(kind: str, seed: int, laps: float, speed: float, tolerance_m: float) -
     noise = Noise(tolerance_m=tolerance_m)
     k = Camera(*sequence.size).matrix()
     intrinsics = (k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-    return Walk(
-        f"{kind} {seed}", flags, list(sequence.stamps_ns), sequence.matrices, 2.0, Drift(), noise, {}, intrinsics
-    )
+
+    def depth(number: int) -> NDArray[np.float32]:
+        return sequence.world.depth(sequence.poses[number], sequence.size)
+
+    stamps = list(sequence.stamps_ns)
+    return Walk(f"{kind} {seed}", flags, stamps, sequence.matrices, 2.0, Drift(), noise, {}, intrinsics, depth)
 
 
 def icl_office(folder: Path) -> Walk:
