@@ -10,6 +10,7 @@ from pnv_ros.recognition import Recognition
 from pnv_ros.saved_map import SavedMap
 from pnv_ros.services import Services
 
+_JPEG = b"\xff\xd8"
 Parts = Callable[[], tuple[SavedMap, Recognition]]
 
 
@@ -56,7 +57,7 @@ class TypedServices:
         with recognition.still():
             if request.id not in database:
                 raise PnvError(f"keyframe {request.id} is not in the map; allowed: an id of a closure or a candidate")
-            response.keyframe = keyframe_to_typed(
-                database.ref(request.id), database.vector(request.id), database.picture(request.id)
-            )
+            kept = database.picture(request.id)  # a JPEG, or what else the verifier keeps
+            picture = kept if kept.startswith(_JPEG) else b""
+            response.keyframe = keyframe_to_typed(database.ref(request.id), database.vector(request.id), picture)
         return f"keyframe {request.id}"
