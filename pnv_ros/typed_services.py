@@ -6,11 +6,11 @@ from typing import Any
 
 from msg_adapters.typed_closures import closures_to_typed, keyframe_to_typed
 from pnv_core.errors import PnvError
+from pnv_core.verify.feature_codes import picture_of
 from pnv_ros.recognition import Recognition
 from pnv_ros.saved_map import SavedMap
 from pnv_ros.services import Services
 
-_JPEG = b"\xff\xd8"
 Parts = Callable[[], tuple[SavedMap, Recognition]]
 
 
@@ -57,7 +57,6 @@ class TypedServices:
         with recognition.still():
             if request.id not in database:
                 raise PnvError(f"keyframe {request.id} is not in the map; allowed: an id of a closure or a candidate")
-            kept = database.picture(request.id)  # a JPEG, or what else the verifier keeps
-            picture = kept if kept.startswith(_JPEG) else b""
+            picture = picture_of(database.picture(request.id))
             response.keyframe = keyframe_to_typed(database.ref(request.id), database.vector(request.id), picture)
         return f"keyframe {request.id}"
