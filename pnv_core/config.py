@@ -121,8 +121,8 @@ class Config:
         "xfeat", "what examines the best candidates beside their patches: xfeat, or a registered name"
     )
     verify: int = setting(
-        3,
-        "best candidates examined by local features of small pictures; 0 = none, and no pictures are kept",
+        5,
+        "best candidates examined by local features; 0 = none, and neither features nor pictures are kept",
         low=0,
         high=100,
     )
@@ -160,7 +160,7 @@ class Config:
     patch_store: str = setting("memory", "where patches of old keyframes live", choices=("memory", "disk"))
     patch_folder: str = setting("", "folder of the patches on disk; empty = /var/tmp")
     disk_budget_gb: float = setting(32.0, "bound on the patches on disk", unit="GB", low=0.0, high=1e6)
-    patch_precision: str = setting("float16", "precision of stored patches", choices=("float32", "float16", "int8"))
+    patch_precision: str = setting("int8", "precision of stored patches", choices=("float32", "float16", "int8"))
 
     def __post_init__(self) -> None:
         checked(self)

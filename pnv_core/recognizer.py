@@ -9,7 +9,7 @@ from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
 from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
 from pnv_core.decide.gates import decided
-from pnv_core.decide.judge import Judge, rank
+from pnv_core.decide.judge import Judge
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
@@ -92,7 +92,7 @@ class PlaceRecognizer:
         self.latest = Query(query, descriptor, predecessor)
         closures = [replace(c, query=query) for c in closures]
         self.sequence.remember(frame.camera, closures, window_of(self.config.consistency + DOUBT))
-        return sorted(map(self._decided, closures), key=rank)
+        return sorted(map(self._decided, closures), key=self.judge.order)
 
     def look_up(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate for an image by itself, best first; nothing is remembered, no keyframe is too young.
@@ -109,7 +109,7 @@ class PlaceRecognizer:
         query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
         closures = self.judge.judge(query, descriptor, 1.0, candidates, list(stored.values()), self.config)
         alone = SequenceMemory(self.database.steps)
-        return sorted((decided(c, self.config, alone) for c in closures), key=rank)
+        return sorted((decided(c, self.config, alone) for c in closures), key=self.judge.order)
 
     def change(self, **live: Any) -> None:
         """Take these live settings from the next frame on. Raises ConfigError for others and for a wrong value."""

@@ -8,6 +8,7 @@ import numpy as np
 from pnv_core.config import Config
 from pnv_core.decide.calibration import Calibration, calibration_for
 from pnv_core.decide.consistency import Steps, by_id
+from pnv_core.decide.order import Order
 from pnv_core.types import NO_PICTURE, Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
 from pnv_core.verify.reranker import Reranker, SpatialResult
 from pnv_core.verify.verifier import VERIFIERS, hull_area
@@ -25,6 +26,7 @@ class Judge:
         self.reranker = Reranker(config)
         self.verifier = VERIFIERS.make(config.verifier, config)
         self.calibration: Calibration = calibration_for(stored_calibration, config)
+        self.order = Order(config)
 
     def judge(
         self,
@@ -61,15 +63,18 @@ class Judge:
                 local_inliers=-1 if reference.thumbnail else NO_PICTURE,
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
-        found.sort(key=lambda pair: rank(pair[0]))
-        if descriptor.thumbnail and config.verify:
-            pictures = [(references[i].thumbnail, c.match.camera) for c, _, i in found[: config.verify]]
-            shown = [(descriptor.thumbnail, query.camera), *(pair for pair in pictures if pair[0])]
-            self.verifier.prepare(shown, self.reranker.workers)
-        for place, (closure, evidence, number) in enumerate(found[: config.verify]):
-            picture = references[number].thumbnail
-            if descriptor.thumbnail and picture:
-                check = self.verifier.check(descriptor.thumbnail, query.camera, picture, closure.match.camera)
+        found.sort(key=lambda pair: self.order(pair[0]))
+        kept = [references[number].thumbnail for _, _, number in found[: config.verify]]
+        if descriptor.thumbnail and any(kept):
+            cameras = [closure.match.camera for closure, _, _ in found]
+            shown = [(picture, camera) for picture, camera in zip(kept, cameras, strict=False) if picture]
+            self.verifier.prepare([(descriptor.thumbnail, query.camera), *shown], self.reranker.workers)
+            checks = self.reranker.workers.map(
+                lambda pair: self.verifier.check(descriptor.thumbnail, query.camera, *pair), shown
+            )
+            places = [place for place, picture in enumerate(kept) if picture]
+            for place, check in zip(places, checks, strict=True):
+                closure, evidence, number = found[place]
                 seen = replace(
                     evidence,
                     local_inliers=check.inliers,
@@ -84,7 +89,7 @@ class Judge:
         closures = [replace(c, score=min(c.score, most)) if e.local_inliers == -1 else c for c, e, _ in found]
         closures = [self._beside_rivals(c, closures) for c in closures]
         rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
-        return sorted(closures + rest, key=rank)
+        return sorted(closures + rest, key=self.order)
 
     def _apart(self, a: ImageRef, b: ImageRef) -> bool:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
@@ -118,11 +123,6 @@ class Judge:
 def _not_reranked(query: ImageRef, match: ImageRef, similarity: float, texture: float) -> LoopClosure:
     evidence = Evidence(similarity=similarity, spatial=0.0, inliers=0, texture=texture)
     return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
-
-
-def rank(closure: LoopClosure) -> tuple[float, float, int]:
-    """Sorts closures of a query best first."""
-    return -closure.score, -closure.similarity, closure.match.id
 
 
 def _inlier_points(

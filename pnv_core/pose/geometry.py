@@ -206,7 +206,6 @@ class _Sight:
         out[one, 0] = (hb * ea).sum(1) / np.sqrt(gradient + 1e-30)
         return out
 
-
     def of_shared(self, pose: Pose) -> Array:
         """(M, 2, 4): how the residuals change where all points of the query or of the match are off by the deviation
         that they share, across or down."""

@@ -220,4 +220,3 @@ def _useful(view: _View, others: list[_View]) -> list[_View]:
         if other.camera == view.camera and _LEAST_WAY_M <= _way(view, other) <= _LONGEST_WAY_M
     ]  # fmt: skip
     return [*stereo[:1], *sorted(moved, key=lambda other: abs(_way(view, other) - _BEST_WAY_M))[:2]]
-

@@ -139,7 +139,9 @@ class XFeatVerifier:
         return self._xfeat.features(grey, valid)
 
     def prepare(self, kept: Iterable[tuple[bytes, str]], workers: Workers) -> None:
-        """Nothing is left to find."""
+        """Unpack features here, in one thread; the checks may then run in several."""
+        for picture, _ in kept:
+            self.features(picture)
 
     def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
         """Two images by what was kept of them."""
@@ -148,10 +150,11 @@ class XFeatVerifier:
 
     def features(self, kept: bytes) -> tuple[LocalFeatures, float]:
         """Features as kept; where a map holds the picture alone, those of the picture."""
-        found = self._features.pop(kept, None) or self._unpacked(kept)
-        self._features[kept] = found
-        while len(self._features) > _CACHED:
-            self._features.popitem(last=False)
+        found = self._features.get(kept)
+        if found is None:
+            found = self._features[kept] = self._unpacked(kept)
+            while len(self._features) > _CACHED:
+                self._features.popitem(last=False)
         return found
 
     def _unpacked(self, kept: bytes) -> tuple[LocalFeatures, float]:

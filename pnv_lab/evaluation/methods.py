@@ -129,7 +129,7 @@ GROUPS = {
     "paper": ("densevlad", "gem", "netvlad", "sift", "multi-ransac"),
     "variants": ("netvlad", "single-rapid", "single-ransac", "multi-rapid", "multi-ransac"),
     "ablations": ("multi-ransac", "equal-weights", "early-fusion", "cross-size", "patch-average", "patch-max"),
-    "presets": ("patchnetvlad", *PUBLISHED_PRESETS, "lightglue-aliked"),
+    "presets": ("patchnetvlad", *PUBLISHED_PRESETS, "lightglue"),
     "all": tuple(name for name in METHODS if name not in (*LIGHTGLUE_KINDS, *PUBLISHED_PRESETS, "patchnetvlad")),
 }
 

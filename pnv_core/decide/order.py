@@ -1,0 +1,34 @@
+"""Which candidate of a query comes first: all evidence together, so that re-ranking does not subtract.
+
+The patches' spatial score alone puts a wrong place first where the viewpoint has changed; the global vector knows more
+there. Weights are those that serve best on the places of `benchmarks/closure_sets.py` that choices are made on.
+"""
+
+import math
+
+from pnv_core.config import Config
+from pnv_core.types import Evidence, LoopClosure
+
+_SPATIAL = 0.04  # of the logarithm of the spatial score, against the cosine
+_LEAST_SPATIAL = 0.01
+_LOCAL = 0.2  # of the logarithm of the local inliers
+_LEAST_LOCAL = 4  # and of what no local feature examined
+
+
+def standing(evidence: Evidence) -> float:
+    """Grows with similarity, spatial score and local inliers; only differences within a query mean something."""
+    spatial = math.log(max(evidence.spatial, _LEAST_SPATIAL) / _LEAST_SPATIAL)
+    local = math.log(max(evidence.local_inliers, _LEAST_LOCAL) / _LEAST_LOCAL)
+    return evidence.similarity + _SPATIAL * spatial + _LOCAL * local
+
+
+class Order:
+    """Sorts closures of a query best first: accepted ones, then by standing; published presets by the paper's score."""
+
+    def __init__(self, config: Config) -> None:
+        self._paper = config.preset != "default"
+
+    def __call__(self, closure: LoopClosure) -> tuple[bool, float, float, int]:
+        evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
+        by = closure.spatial if self._paper else standing(evidence)
+        return not closure.accepted, -by, -closure.similarity, closure.match.id
