@@ -23,12 +23,15 @@ def standing(evidence: Evidence) -> float:
 
 
 class Order:
-    """Sorts closures of a query best first: accepted ones, then by standing; published presets by the paper's score."""
+    """Sorts closures of a query best first: accepted ones by their score, the others by standing.
+
+    Published presets sort those by the paper's score.
+    """
 
     def __init__(self, config: Config) -> None:
         self._paper = config.preset != "default"
 
     def __call__(self, closure: LoopClosure) -> tuple[bool, float, float, int]:
         evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
-        by = closure.spatial if self._paper else standing(evidence)
+        by = closure.score if closure.accepted else closure.spatial if self._paper else standing(evidence)
         return not closure.accepted, -by, -closure.similarity, closure.match.id

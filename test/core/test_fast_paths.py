@@ -339,7 +339,7 @@ from pnv_core import Config, Describer, Frame, PlaceRecognizer, load_describer
 
 recognizer = PlaceRecognizer(load_describer(min_interval_s=0.0, min_change=0.0, exclude_recent_s=10.0))
 for second in (0, 60):
-    image = np.random.default_rng(1).integers(0, 256, (60, 80, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    image = np.random.default_rng(1).integers(0, 256, (20, 26, 3), np.uint8).repeat(24, 0).repeat(24, 1)
     closures = recognizer.process(Frame(second * 10**9, "front", image))
 assert closures[0].evidence.local_inliers > 20
 print([name for name in ("torch", "numba", "llvmlite", "onnxruntime", "scipy", "nncf") if name in sys.modules])
