@@ -34,7 +34,7 @@ def test_the_interface_page_names_every_topic_and_service_of_the_node(idle, list
     services = dict(graph.get_service_names_and_types_by_node("place_recognizer", "/"))
     named = {name: kinds for name, kinds in topics.items() if name not in own}
     named |= {n: k for n, k in services.items() if k[0].startswith("std_srvs")}
-    assert len(named) == (11 if typed_type() is None else 12)
+    assert len(named) == (12 if typed_type() is None else 13)
     for name, (kind,) in named.items():
         in_page = name.replace(NODE + "/", "~/").replace("/loop_closures", "loop_closures")
         assert re.search(rf"\| `{re.escape(in_page)}` \| {kind.replace('/msg/', '/').replace('/srv/', '/')} ", page)
