@@ -51,7 +51,6 @@ DASK = ["distributed>=2024.1"]  # evaluation on several machines; lighter than R
 DEVELOPMENT = [
     "pytest>=8",
     "pytest-xdist>=3.5",  # two files at a time: half of the time of many tests is waiting for a process
-    "pytest-rerunfailures>=14",  # what the scheduler decides is tried again
     "hypothesis>=6.100",
     "rosbags-image>=0.10",  # an independent decoder to test against; it knows neither row padding nor size limits
     "ruff==0.17.6",  # the linters are pinned: a later one finds what this one does not
