@@ -20,6 +20,7 @@ class NewestFrames:
 
     def __init__(self) -> None:
         self._waiting: dict[str, WaitingFrame] = {}  # in the order in which cameras began to wait
+        self._turns: dict[str, int] = {}  # camera: when it was last served, counted in frames
         self._changed = threading.Condition()
         self._closed = False
 
@@ -32,12 +33,18 @@ class NewestFrames:
             return replaced
 
     def take(self) -> WaitingFrame | None:
-        """The frame of the camera that has waited longest; blocks until there is one, None once closed."""
+        """A frame of the camera that was served longest ago; blocks until there is one, None once closed.
+
+        Not of the one that began to wait first: of cameras that send at once the first would always come before the
+        others.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._closed or self._waiting)
             if self._closed:
                 return None
-            return self._waiting.pop(next(iter(self._waiting)))
+            camera = min(self._waiting, key=lambda waiting: self._turns.get(waiting, 0))
+            self._turns[camera] = 1 + max(self._turns.values(), default=0)
+            return self._waiting.pop(camera)
 
     def close(self) -> None:
         """Let go of what waits; every `take` from now on gives None."""

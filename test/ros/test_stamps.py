@@ -84,6 +84,18 @@ def test_used_stamps_of_a_camera_rise(events):
             used[camera] = seconds
 
 
+@given(st.lists(st.integers(0, 4), min_size=1, max_size=40))
+def test_cameras_that_send_at_once_are_served_in_turns(taken_between):
+    """However many frames are taken between two rounds, no camera is ahead of another by more than one."""
+    slot, served = NewestFrames(), dict.fromkeys("abcd", 0)
+    for number, taken in enumerate(taken_between):
+        for camera in served:
+            slot.put(WaitingFrame(camera, number, 0, b"", object))
+        for _ in range(taken):
+            served[slot.take().camera] += 1
+        assert max(served.values()) - min(served.values()) <= 1
+
+
 @given(st.lists(st.sampled_from("abc"), min_size=1, max_size=30))
 def test_the_slot_keeps_the_newest_frame_of_each_camera_in_order_of_waiting(cameras):
     slot, expected = NewestFrames(), {}

@@ -42,17 +42,17 @@ def test_where_raw_images_are_lost_the_node_asks_for_jpegs_by_itself(domain, lis
             assert health.values()[f"lost on the way, {RAW} [%]"] == "0"
 
 
-def test_four_cameras_are_all_served(domain, listener, tmp_path):
+def test_four_cameras_have_equal_shares(domain, listener, tmp_path):
     topics = ["front", "left", "rear", "right"]
     health = Health(listener)
     with (
         running_node(image_topics=topics, min_interval_s=0.0, min_change=0.0, threads=1) as node,
         cameras(tmp_path, "--topic", ",".join(topics), "--encoding", "jpeg", rate=10),
     ):
-        wait_until(lambda: health.count("frames processed") >= 300, 120, "frames of every camera")
+        wait_until(lambda: health.count("frames processed") >= 60, 60, "frames of every camera")
         values = health.fresh() and health.values()
         shares = [int(values[f"share of what is processed, {topic} [%]"]) for topic in topics]
         assert sum(shares) == pytest.approx(100, abs=2)
-        assert min(shares) >= 15  # the first of the four gets 32 to 34 on two idle cores, the others 22 to 23
-        assert max(shares) <= 40
+        assert min(shares) >= 20
+        assert max(shares) <= 30
         assert "Traceback" not in node.output
