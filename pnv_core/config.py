@@ -16,40 +16,24 @@ _PUBLISHED: dict[str, Any] = {
     "patch_precision": "float32",
     "scale_weight": 0.0,
 }
+_SEVERAL_SIZES = _PUBLISHED | {
+    "patch_sizes": (2, 5, 8),
+    "patch_strides": (1, 1, 1),
+    "patch_weights": (0.45, 0.15, 0.4),
+    "scorer": "ransac",
+}
+_ONE_SIZE = _PUBLISHED | {
+    "patch_sizes": (5,),
+    "patch_strides": (1,),
+    "patch_weights": (1.0,),
+    "scorer": "rapid",
+}
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
-    "performance": _PUBLISHED
-    | {
-        "weights": "mapillary_WPCA4096",
-        "patch_sizes": (2, 5, 8),
-        "patch_strides": (1, 1, 1),
-        "patch_weights": (0.45, 0.15, 0.4),
-        "scorer": "ransac",
-    },
-    "balanced": _PUBLISHED
-    | {
-        "weights": "mapillary_WPCA512",
-        "patch_sizes": (2, 5, 8),
-        "patch_strides": (1, 1, 1),
-        "patch_weights": (0.45, 0.15, 0.4),
-        "scorer": "ransac",
-    },
-    "speed": _PUBLISHED
-    | {
-        "weights": "mapillary_WPCA512",
-        "patch_sizes": (5,),
-        "patch_strides": (1,),
-        "patch_weights": (1.0,),
-        "scorer": "rapid",
-    },
-    "storage": _PUBLISHED
-    | {
-        "weights": "mapillary_WPCA128",
-        "patch_sizes": (5,),
-        "patch_strides": (1,),
-        "patch_weights": (1.0,),
-        "scorer": "rapid",
-    },
+    "performance": _SEVERAL_SIZES | {"weights": "mapillary_WPCA4096"},
+    "balanced": _SEVERAL_SIZES | {"weights": "mapillary_WPCA512"},
+    "speed": _ONE_SIZE | {"weights": "mapillary_WPCA512"},
+    "storage": _ONE_SIZE | {"weights": "mapillary_WPCA128"},
 }
 
 
