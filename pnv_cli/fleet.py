@@ -2,30 +2,26 @@
 
 import argparse
 import os
-import time
-from datetime import datetime, timezone
 from pathlib import Path
 
-import numpy as np
+from pnv_cli.common import add_config_flags
 
-from pnv_cli.common import add_config_flags, config_from
-from pnv_core.describe.describer import Describer, describer_from
-from pnv_core.errors import ConfigError
-from pnv_core.images import read_image
-from pnv_core.types import ImageRef, PlaceDescriptor, Query
-from pnv_fleet import maps
-from pnv_fleet.answers import Answers
-from pnv_fleet.errors import FleetError
-from pnv_fleet.places import descriptor_of, layouts_of, parts_of, robot_name, without_picture
-from pnv_fleet.store import Access, PlaceStore
+ACTIONS = {
+    "status": "what the store holds, per robot",
+    "push": "a saved map goes up under a robot's name",
+    "pull": "a selection comes down as a map that a node loads",
+    "query": "where has the fleet seen this image?",
+    "forget": "a robot, a session, an area, old or covered places",
+    "verify": "read every row and check it",
+}
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
     parser = subparsers.add_parser("fleet", help="places that robots share", allow_abbrev=False)
     actions = parser.add_subparsers(required=True, metavar="ACTION")
-    for name, (run, what) in ACTIONS.items():
+    for name, what in ACTIONS.items():
         action = actions.add_parser(name, help=what, description=what, allow_abbrev=False)
-        action.set_defaults(run=run)
+        action.set_defaults(run=_act, action=name)
         action.add_argument(
             "--uri",
             default=os.environ.get("PNV_FLEET_URI", ""),
@@ -53,119 +49,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         add_config_flags(action)
 
 
-def _opened(args: argparse.Namespace, create: bool = False) -> tuple[PlaceStore, Describer, PlaceDescriptor]:
-    if not args.uri:
-        raise ConfigError("no --uri given; allowed: http(s)://HOST:PORT, NAME.db, or PNV_FLEET_URI in the environment")
-    if not args.uri.startswith("http") and not create and not Path(args.uri).exists():
-        raise FleetError(f"{args.uri} does not exist; allowed: a store that `pnv fleet push` or a node made")
-    describer = describer_from(config_from(args))
-    width, height = describer.image_size
-    like = describer.describe(np.zeros((height, width, 3), np.uint8))
-    size = (len(like.global_vector), parts_of(layouts_of(like))) if create else ()
-    return PlaceStore(args.uri, describer.map_fingerprint, Access.from_environment(), *size), describer, like
+def _act(args: argparse.Namespace) -> int:
+    from pnv_cli.fleet_actions import ACTIONS as DONE  # numpy, the describer and the store: not for --help
 
-
-def _where(args: argparse.Namespace) -> str:
-    """The expression of the flags; empty for none of them."""
-    terms = []
-    if args.robot:
-        terms.append(f'robot == "{robot_name(args.robot)}"')
-    if args.session is not None:
-        terms.append(f"session == {args.session}")
-    if args.since:
-        try:
-            moment = datetime.fromisoformat(args.since)
-        except ValueError:
-            raise ConfigError(f"--since {args.since}; allowed: a moment as 2026-05-01T12:00 (UTC)") from None
-        utc = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-        terms.append(f"stamp_ns >= {int(utc.timestamp() * 1e9)}")
-    if args.area:
-        try:
-            x, y, radius = (float(part) for part in args.area.split(","))
-        except ValueError:
-            raise ConfigError(f"--area {args.area}; allowed: X,Y,R in metres") from None
-        terms.append(f"posed == true and x >= {x - radius!r} and x <= {x + radius!r}")
-        terms.append(f"y >= {y - radius!r} and y <= {y + radius!r}")
-    if getattr(args, "older_than", None) is not None:
-        terms.append(f"stamp_ns < {int((time.time() - args.older_than * 86400) * 1e9)}")
-    return " and ".join(terms)
-
-
-def _status(args: argparse.Namespace) -> int:
-    store, _, _ = _opened(args)
-    print(f"{store.uri}: {store.version()}, collection {store.collection}, {store.count()} places")
-    print(f"{'robot':<24}{'places':>9}{'sessions':>10}  first and last (UTC)")
-    for robot, (count, sessions, first, last) in maps.robots(store).items():
-        span = " to ".join(datetime.fromtimestamp(s / 1e9, timezone.utc).strftime("%F %T") for s in (first, last))
-        print(f"{robot:<24}{count:>9}{sessions:>10}  {span}")
-    return 0
-
-
-def _push(args: argparse.Namespace) -> int:
-    if not args.robot:
-        raise ConfigError("push needs --robot NAME, whose map it is")
-    store, describer, like = _opened(args, create=True)
-    count = maps.push(store, args.map, args.robot, describer.map_fingerprint, like, args.pictures)
-    print(f"{store.uri}: {count} keyframes of {args.robot}")
-    return 0
-
-
-def _pull(args: argparse.Namespace) -> int:
-    store, describer, like = _opened(args)
-    manifest = maps.pull(store, _where(args), args.output, describer.map_fingerprint, like)
-    print(f"{args.output}: {manifest.keyframes} keyframes in {len(manifest.sessions)} sessions")
-    return 0
-
-
-def _query(args: argparse.Namespace) -> int:
-    store, describer, like = _opened(args)
-    rgb = read_image(args.image)
-    answers = Answers(describer.config.replace(consistency=0), describer.model.info.calibration, like)
-    seen = describer.describe(rgb)
-    seen = PlaceDescriptor(seen.global_vector, seen.patches, seen.texture, answers.keep(rgb))
-    where = f'robot == "{robot_name(args.robot)}"' if args.robot else ""
-    found = answers.to(Query(ImageRef(-1, 0, "query"), without_picture(seen), 1.0), store, where)
-    for line in answers.refused:
-        print(f"refused {line}")
-    print(f"{'robot':<24}{'stamp':>22}  {'score':>6}{'similarity':>12}  verdict")
-    for c in found:
-        verdict = "accepted" if c.accepted else c.reason
-        print(f"{c.match.robot:<24}{c.match.stamp_ns / 1e9:>22.9f}  {c.score:>6.3f}{c.similarity:>12.3f}  {verdict}")
-    return 0
-
-
-def _forget(args: argparse.Namespace) -> int:
-    where = _where(args)
-    if not where and args.covered is None and not args.all:
-        raise ConfigError("nothing is named to forget; allowed: --robot, --session, --since, --area, --older-than, "
-                          "--covered or --all")  # fmt: skip
-    store, _, _ = _opened(args)
-    count = maps.thin(store, args.covered) if args.covered is not None else store.forget(where or 'key != ""')
-    print(f"{store.uri}: forgot {count} places, {store.count()} are left")
-    return 0
-
-
-def _verify(args: argparse.Namespace) -> int:
-    store, _, like = _opened(args)
-    whole = damaged = 0
-    for place in store.scan(views=True):
-        try:
-            if isinstance(place, str):
-                raise FleetError(place)
-            descriptor_of(place, like)
-            whole += 1
-        except FleetError as error:
-            damaged += 1
-            print(error)
-    print(f"{store.uri}: {whole} places are whole, {damaged} are not")
-    return 2 if damaged else 0
-
-
-ACTIONS = {
-    "status": (_status, "what the store holds, per robot"),
-    "push": (_push, "a saved map goes up under a robot's name"),
-    "pull": (_pull, "a selection comes down as a map that a node loads"),
-    "query": (_query, "where has the fleet seen this image?"),
-    "forget": (_forget, "a robot, a session, an area, old or covered places"),
-    "verify": (_verify, "read every row and check it"),
-}
+    return DONE[args.action](args)
