@@ -67,6 +67,23 @@ def test_every_setting_of_the_settings_page_exists():
     assert named <= {*settings_of(Config), *settings_of(NodeConfig)}
 
 
+# As rosdistro has them: rosdep/python.yaml at 000730dc, each with a rule for Ubuntu, and jazzy/distribution.yaml at
+# 0006cdad, where rcl_interfaces, common_interfaces, geometry2, rclpy and launch_ros release them.
+ROSDEP_KEYS = {
+    "python3-matplotlib", "python3-numpy", "python3-opencv", "python3-pytest", "python3-scipy", "python3-tqdm",
+    "python3-yaml",
+    "builtin_interfaces", "lifecycle_msgs", "rcl_interfaces",
+    "diagnostic_msgs", "geometry_msgs", "nav_msgs", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs",
+    "tf2_msgs", "rclpy", "ros2launch",
+}  # fmt: skip
+
+
+def test_rosdep_knows_every_dependency():
+    named = re.findall(r"<(?:\w+_)?depend>(.*?)</", (ROOT / "package.xml").read_text())
+    assert len(named) > 15
+    assert set(named) <= ROSDEP_KEYS
+
+
 def test_one_version_everywhere():
     versions = {
         re.search(pattern, (ROOT / file).read_text()).group(1)  # type: ignore[union-attr]
