@@ -4,6 +4,7 @@ The network is plain convolutions on the inference backend; its weights are Apac
 an image, H x W its grey picture with sides that are multiples of 32, h x w = H / 8 x W / 8.
 """
 
+import math
 from functools import lru_cache
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from pnv_core.networks.layers import (
     SpaceToDepth,
     same_pads,
 )
-from pnv_core.networks.openvino_backend import Compiled, Node, build, constant, integers
+from pnv_core.networks.openvino_backend import Compiled, build, integers
 from pnv_core.verify.local_features import LocalFeatures, no_features
 
 WEIGHTS = Path(__file__).parents[1] / "models" / "xfeat.safetensors"
@@ -59,10 +60,11 @@ _DESCRIPTORS = (
     Add(((), _COARSE)),
     *_chain("block_fusion", (64,), (64,)),
     Conv("block_fusion.2", 64),
-    Concat(((), (*_chain("heatmap_head", (64, 1), (64, 1)), Conv("heatmap_head.2", 1)))),
 )
+_RELIABILITY = (*_chain("heatmap_head", (64, 1), (64, 1)), Conv("heatmap_head.2", 1))
 _CORNERS = (SpaceToDepth(_CELL), *_chain("keypoint_head", (64, 1), (64, 1), (64, 1)), Conv("keypoint_head.3", 65))
-NETWORK: Network = (InstanceNorm(), Concat((_DESCRIPTORS, _CORNERS)))
+_NORM = InstanceNorm()
+NETWORK: Network = (_NORM, Concat(((*_DESCRIPTORS, Concat(((), _RELIABILITY))), _CORNERS)))
 """(1, H, W) -> (64 + 1 + 65, h, w): descriptors, log odds of their reliability, logits of the corner in each cell."""
 
 
@@ -82,15 +84,18 @@ class XFeat:
     def features(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
         """(h, w), optionally bool of the pixels to use -> the features, the surest first."""
         picture = self._sized(grey)
-        if picture.std() < _TEXTURE:
+        normal = _normalised(picture)
+        if normal is None:
             return no_features(64)
-        corners, reliable, descriptors = self._compiled(*picture.shape)(picture[None, None])
         rows, cols = picture.shape
-        score = corners.reshape(rows, cols)
+        heat, reliable, descriptors = self._compiled(rows, cols)(normal[None, None])
+        score = heat.reshape(rows, cols)
+        highest = cv2.dilate(score, np.ones((_NEIGHBOURHOOD, _NEIGHBOURHOOD), np.uint8))
+        peak = (score == highest) & (score > _LEAST_SCORE)
         if valid is not None:
             mask = cv2.resize(valid.astype(np.uint8), (cols, rows), interpolation=cv2.INTER_NEAREST)
-            score = score * cv2.erode(mask, np.ones((9, 9), np.uint8))  # the border of the mask is no feature
-        y, x = np.nonzero(score)
+            peak &= cv2.erode(mask, np.ones((9, 9), np.uint8)) > 0  # the border of the mask is no feature
+        y, x = np.nonzero(peak)
         at = np.stack([x / (cols - 1) * (cols // _CELL), y / (rows - 1) * (rows // _CELL)], 1) - 0.5
         sure = score[y, x] * _sampled(reliable[0, 0, :, :, None], at)[:, 0]
         best = np.argsort(-sure, kind="stable")[: self.most]
@@ -100,35 +105,37 @@ class XFeat:
         points = np.stack([(x[best] + 0.5) / cols, (y[best] + 0.5) / rows * aspect], 1)
         return LocalFeatures(points.astype(np.float32), found)
 
-    def _sized(self, grey: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """In [0, 1], the longer side `width`, the shorter within 16 pixels of what keeps the aspect."""
+    def _sized(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The longer side `width`, the shorter within 16 pixels of what keeps the aspect."""
         height, width = grey.shape
         long, short = max(height, width), min(height, width)
         other = max(_SIDE, round(self.width * short / long / _SIDE) * _SIDE)
         size = (self.width, other) if width >= height else (other, self.width)
         way = cv2.INTER_AREA if long > self.width else cv2.INTER_LINEAR
-        return cv2.resize(grey, size, interpolation=way) / np.float32(255)
+        return cv2.resize(grey, size, interpolation=way)
+
+
+def _normalised(picture: NDArray[np.uint8]) -> NDArray[np.float32] | None:
+    """Mean 0 and variance 1, as _NORM does it to a picture in [0, 1]; None for one that shows nothing."""
+    mean, deviation = (float(of[0, 0]) / 255 for of in cv2.meanStdDev(picture))
+    if deviation < _TEXTURE:
+        return None
+    gain = 1 / math.hypot(deviation, math.sqrt(_NORM.epsilon))
+    return picture * np.float32(gain / 255) - np.float32(mean * gain)
 
 
 def _graph(rows: int, cols: int) -> ov.Model:
-    """(1, 1, H, W) -> scores of the corners (1, 1, H, W), 0 elsewhere; reliability (1, 1, h, w);
+    """(1, 1, H, W) of mean 0 and variance 1 -> how sure each pixel is a corner (1, 1, H, W); reliability (1, 1, h, w);
     unit descriptors (1, h, w, 64).
     """
     picture = ops.parameter([1, 1, rows, cols], np.float32)
-    maps = build(NETWORK, _weights(), picture)
-    corner = _channels(ops.softmax(_channels(maps, 65, 130), 1), 0, 64)
-    heat = ops.depth_to_space(corner, "depth_first", _CELL)
-    reach = [_NEIGHBOURHOOD // 2] * 2
-    highest = ops.max_pool(heat, [1, 1], [1, 1], reach, reach, [_NEIGHBOURHOOD] * 2).output(0)
-    peak = ops.logical_and(ops.equal(heat, highest), ops.greater(heat, constant(_LEAST_SCORE)))
-    scores = ops.select(peak, heat, constant(0.0))
-    descriptors = ops.normalize_l2(_channels(maps, 0, 64), integers(1), _EPSILON**2, "max")
-    outputs = [scores, ops.sigmoid(_channels(maps, 64, 65)), ops.transpose(descriptors, integers(0, 2, 3, 1))]
-    return ov.Model(outputs, [picture], "xfeat")
-
-
-def _channels(x: Node, first: int, end: int) -> Node:
-    return ops.slice(x, integers(first), integers(end), integers(1), integers(1))
+    maps = build(_DESCRIPTORS, _weights(), picture)
+    cells = ops.softmax(build(_CORNERS, _weights(), picture), 1)  # the last: no corner in this cell
+    corners = ops.slice(cells, integers(0), integers(_CELL**2), integers(1), integers(1))
+    heat = ops.depth_to_space(corners, "depth_first", _CELL)
+    reliability = ops.sigmoid(build(_RELIABILITY, _weights(), maps))
+    descriptors = ops.transpose(ops.normalize_l2(maps, integers(1), _EPSILON**2, "max"), integers(0, 2, 3, 1))
+    return ov.Model([heat, reliability, descriptors], [picture], "xfeat")
 
 
 def _sampled(values: NDArray[np.float32], at: NDArray[np.float64]) -> NDArray[np.float32]:
