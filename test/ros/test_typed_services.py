@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 
@@ -47,7 +48,11 @@ def test_maps_go_to_paths_an_image_finds_its_place_and_a_keyframe_can_be_had(lis
         keyframe = ask(GetKeyframe, "get_keyframe", id=2).keyframe
         assert keyframe.image.stamp.sec == at(2) // 10**9
         assert np.linalg.norm(keyframe.descriptor) == pytest.approx(1, abs=1e-3)
-        assert bytes(keyframe.thumbnail[:2]) in (b"", b"\xff\xd8")  # none where the verifier keeps no picture
+        shown = cv2.imdecode(np.frombuffer(bytes(keyframe.thumbnail), np.uint8), cv2.IMREAD_UNCHANGED)
+        seen = cv2.resize(cv2.cvtColor(scene(2), cv2.COLOR_RGB2GRAY), shown.shape[::-1], interpolation=cv2.INTER_AREA)
+        assert shown.ndim == 2  # a small grey JPEG of that place, and of no other
+        assert bytes(keyframe.thumbnail[:2]) == b"\xff\xd8"
+        assert np.corrcoef(shown.ravel(), seen.ravel())[0, 1] > 0.9
         assert "keyframe 99 is not in the map" in ask(GetKeyframe, "get_keyframe", id=99).message
 
         assert str(tmp_path / "no") in ask(LoadMap, "load_map", path=str(tmp_path / "no")).message
@@ -56,6 +61,14 @@ def test_maps_go_to_paths_an_image_finds_its_place_and_a_keyframe_can_be_had(lis
         assert f"loaded 4 keyframes from {tmp_path / 'other'}" in done.message
         assert node.end() == 0
         assert "Traceback" not in node.output
+
+
+def test_a_keyframe_of_a_node_that_verifies_nothing_has_no_picture(listener):
+    with running_node(verify=0, **EAGER) as node:
+        Camera(listener, Health(listener), "camera/image_raw").send(image(scene(0), at(0)))
+        answer = listener.call(GetKeyframe, f"{NODE}/get_keyframe", GetKeyframe.Request(id=0))
+        assert (answer.success, len(answer.keyframe.thumbnail)) == (True, 0)
+        assert node.end() == 0
 
 
 def test_without_pnv_msgs_the_node_has_the_other_services(listener):
