@@ -73,7 +73,8 @@ faults: $(READY)
 	@status=0; PNV_FULL_TESTS=1 PNV_ROS_FAULTS=full PNV_FAULT_TABLE=$(CURDIR)/out/faults.jsonl OMP_NUM_THREADS=1 \
 	    $(BIN)/python -m pytest -p no:randomly test/maps test/database/test_failing_disk.py \
 	    test/decide/test_odometry.py test/decide/test_calibration.py test/adapters/test_camera_info.py test/core/test_files.py \
-	    test/ros/test_faults.py test/ros/test_hostile_inputs.py test/ros/test_saving.py test/cli/test_hostile_values.py $(ARGS) || status=$$?; \
+	    test/ros/test_faults.py test/ros/test_hostile_inputs.py test/ros/test_saving.py test/ros/test_endings.py \
+	    test/ros/test_reference.py test/ros/test_security.py test/cli/test_hostile_values.py $(ARGS) || status=$$?; \
 	    $(BIN)/python -m test.tally out/faults.jsonl; exit $$status
 
 soak: $(READY)

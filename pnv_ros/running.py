@@ -1,4 +1,4 @@
-"""The executable `place_recognizer`: one node, ended by SIGINT, SIGTERM or its own failure."""
+"""Running the node: one process, ended by SIGINT, SIGTERM or its own failure."""
 
 import gc
 import re
@@ -77,6 +77,7 @@ def main(args: list[str] | None = None) -> int:
         print(f"place_recognizer: {one_line(_first_words(error))}", file=sys.stderr)
         return UNUSABLE_INPUT
     if "--help" in others or "-h" in others:
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # for `--help | head`
         print(help_text())
         return 0
     if others:
@@ -115,7 +116,3 @@ def main(args: list[str] | None = None) -> int:
 def _first_words(error: Exception) -> str:
     """What rcl says before it lists the places in its source."""
     return re.sub(r",? at \S+:\d+.*", "", str(error).splitlines()[0]) if str(error) else repr(error)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

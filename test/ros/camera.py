@@ -81,6 +81,10 @@ class Health:
     def count(self, key: str) -> int:
         return int(self.values().get(key, 0))
 
+    def working(self) -> bool:
+        """Whether frames were processed."""
+        return self.count("frames processed") > 0
+
     def dealt_with(self) -> int:
         """Frames processed or dropped."""
         values = self.values()

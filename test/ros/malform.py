@@ -74,6 +74,7 @@ def main() -> int:
     parser = argparse.ArgumentParser()
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--good-every", type=int, default=50)
+    parser.add_argument("--begin", type=int, default=EPOCH_S, help="seconds of the first stamp")
     args = parser.parse_args()
     rclpy.init()
     node = rclpy.create_node("broken_camera")
@@ -84,7 +85,7 @@ def main() -> int:
     while not all(p.get_subscription_count() for p in publishers.values()):
         time.sleep(0.05)
     time.sleep(0.5)
-    stamp_ns, offered, good = EPOCH_S * 10**9, 0, 0
+    stamp_ns, offered, good = args.begin * 10**9, 0, 0
 
     def good_ones() -> None:
         nonlocal stamp_ns, good

@@ -14,6 +14,7 @@ from pnv_ros.bridges.config import BRIDGE_SETTINGS
 from pnv_ros.node_config import NodeConfig
 from pnv_ros.parameters import DECLARED, NODE, RECOGNISER, descriptor_of, preset_defaults
 from test.ros.processes import ROOT
+from test.tally import tally
 
 LAUNCH_FILES = sorted((ROOT / "launch").glob("*.launch.py"))
 
@@ -66,9 +67,17 @@ class _Call:
             for pair in kwargs.get("remappings", ()):
                 for side in pair:
                     _check_substitutions(side)
+            if isinstance(kwargs["parameters"], str):
+                raise TypeError(f"Expecting list of parameters, got {kwargs['parameters']}")
             for part in kwargs["parameters"]:
-                if not isinstance(part, dict):
+                if isinstance(part, dict):
+                    for key, value in part.items():
+                        _check_substitutions(key)
+                        _check_parameter(value)
+                else:
                     _check_substitutions(part)
+        if name == "DeclareLaunchArgument" and not all(isinstance(t, str) for t in (*args, kwargs["description"])):
+            raise TypeError("name and description are texts")
 
 
 def _check_substitutions(given):
@@ -78,12 +87,41 @@ def _check_substitutions(given):
             raise TypeError(f"Failed to normalize given item of type {type(part)!r}")
 
 
+def _check_parameter(value):
+    """Text, a number, a substitution, a ParameterValue, or a flat list: launch_ros' normalize_parameter_dict."""
+    if getattr(value, "name", None) == "ParameterValue" or isinstance(value, str | int | float | bool):
+        return
+    if isinstance(value, list | tuple):
+        for part in value:
+            _check_substitutions([part] if not isinstance(part, int | float) else [])
+    elif getattr(value, "name", None) not in _Call.SUBSTITUTIONS:
+        raise TypeError(f"Unexpected type for parameter value {value!r}")
+
+
 def test_the_stand_in_refuses_what_launch_3_4_3_refuses():
+    """As ros2/launch 073c3ac normalize_to_list_of_substitutions_impl.py and 06dc66b declare_launch_argument.py, and
+    ros2/launch_ros 076df87 normalize_parameters.py have it."""
     log = []
     preset = _Call("LaunchConfiguration", log, "preset")
     _Call("PathJoinSubstitution", log, ["config", preset])
+    for wrong in ({"default_value": [preset, ["config"]]}, {"default_value": 1.0}, {"description": preset}):
+        with pytest.raises(TypeError):
+            _Call("DeclareLaunchArgument", log, "name", **{"description": "d"} | wrong)
     with pytest.raises(TypeError, match="normalize"):
         _Call("PathJoinSubstitution", log, ["config", [preset, ".yaml"]])
+    node = {"package": "pnv_ros", "executable": "place_recognizer"}
+    _Call("Node", log, **node, parameters=[[preset, ".yaml"], {"a": preset, "b": [1.0, 2.0], "c": "text", "d": True}])
+    for wrong in (
+        "file.yaml",
+        [[["file.yaml"]]],
+        [{"a": None}],
+        [{"a": {1, 2}}],
+        [{1: "a"}],
+        [None],
+        [{"a": [[preset]]}],
+    ):
+        with pytest.raises(TypeError):
+            _Call("Node", log, **node, parameters=wrong)
 
 
 def _stubs(log):
@@ -136,6 +174,7 @@ def test_launch_files_name_only_what_exists(path, monkeypatch):
         _, folder, argument, suffix = files
         assert argument.args == ("preset",)
         assert all((ROOT / (folder.strip("/")) / (preset + suffix)).is_file() for preset in PRESETS)
+    tally("7 launch files, built as launch 3.4.3 checks them", 1, 1)
 
 
 def test_there_is_a_launch_file_for_a_bag_for_two_cameras_and_for_every_bridge():
