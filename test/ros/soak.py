@@ -50,20 +50,27 @@ def main() -> int:
         keep = {"map_path": place, "autosave": True, "autosave_interval_s": 60.0, "memory_budget_mb": 64.0}
         writer = csv.writer(table)
         writer.writerow(FIELDS)
-        with running_node(**keep, min_change=0.0) as node:
-            health, began = Health(listener), time.monotonic()
-            camera = publisher("--stamps", str(stamps), "--rate", str(args.rate))
-            while camera.child.poll() is None:
-                time.sleep(min(10.0, args.seconds / 10))
-                rows.append(sample(node, health, began, place))
-                writer.writerow([f"{value:.2f}" for value in rows[-1]])
-                table.flush()
-            _plot(rows, args.output)
-            status = node.end(timeout=300.0)
-        listener.close()
+        try:
+            with running_node(**keep, min_change=0.0) as node:
+                health, began = Health(listener), time.monotonic()
+                camera = publisher("--stamps", str(stamps), "--rate", str(args.rate))
+                while camera.child.poll() is None:
+                    time.sleep(min(10.0, args.seconds / 10))
+                    rows.append(sample(node, health, began, place))
+                    writer.writerow([f"{value:.2f}" for value in rows[-1]])
+                    table.flush()
+                ending = time.monotonic()
+                status = node.end(timeout=300.0)
+                print(f"the end took {time.monotonic() - ending:.1f} s")
+                said = [line for line in node.lines if "autosaved" not in line and "[INFO]" not in line]
+        finally:  # a listener that still spins would abort the process at its end
+            listener.close()
+            if rows:
+                _plot(rows, args.output)
     print(", ".join(FIELDS))
     for at in range(5):
         print(", ".join(f"{value:.1f}" for value in rows[(len(rows) - 1) * at // 4]))
+    print(*said[-20:], sep="\n")
     print(f"exit status {status}; {args.output}")
     return status
 
