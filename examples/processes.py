@@ -75,20 +75,22 @@ def node_process(
     assignments: Sequence[str],
     echo: IO[str] | None,
     namespace: str = "",
+    executable: str = "place_recognizer",
 ) -> Process:
-    """The installed `place_recognizer` with ROS parameters, and more of them as `name:=value`.
+    """An installed executable with ROS parameters, and more of them as `name:=value`.
 
     Raises PnvError where it is not installed.
     """
-    beside = Path(sys.executable).parent / "place_recognizer"
-    executable = str(beside) if beside.exists() else shutil.which("place_recognizer")
-    if executable is None:
-        raise PnvError(f"no place_recognizer beside {sys.executable} or on the PATH; allowed: after `make install`")
+    beside = Path(sys.executable).parent / executable
+    path = str(beside) if beside.exists() else shutil.which(executable)
+    if path is None:
+        raise PnvError(f"no {executable} beside {sys.executable} or on the PATH; allowed: after `make install`")
     given = [f"{name}:={_yaml(value)}" for name, value in parameters.items()] + list(assignments)
     flags = [flag for assignment in given for flag in ("-p", assignment)]
     if namespace:
         flags += ["-r", f"__ns:={namespace}"]
-    return Process("node", [executable, "--ros-args", *flags], environment, echo)
+    return Process("node" if executable == "place_recognizer" else executable, [path, "--ros-args", *flags],
+                   environment, echo)  # fmt: skip
 
 
 def publisher_process(environment: dict[str, str], flags: Sequence[str]) -> Process:

@@ -1,8 +1,9 @@
-"""make slam-demo: loop closures of the real node correct a drifting odometry, live, in a pose graph on GTSAM.
+"""make slam-demo: loop closures of the real node correct a drifting odometry, live, by the real tf_bridge.
 
-For every walk the node, a publisher and a back end talk over the real middleware. Then the recorded closures meet
-other drifts and injected false closures, with and without the robust solution. Writes slam.png, slam.csv and each
-walk's trajectories. Ends with 1 where a trajectory got worse or fewer than all errors were halved.
+For every walk place_recognizer, tf_bridge and a publisher of images and odometry are processes that talk over the real
+middleware; the corrected trajectory is tf_bridge's path. Then the recorded closures meet other drifts and injected
+false closures, with and without the robust solution. Writes slam.png, slam.csv and each walk's trajectories. Ends with
+1 where a trajectory got worse or fewer than all errors were halved.
 """
 
 import argparse
@@ -10,18 +11,20 @@ import csv
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException
 
-from examples.pose_graph.back_end import BackEndNode, Recording, graph_of
+from examples.pose_graph.back_end import Follower, Recording, between_nodes
 from examples.pose_graph.drift import drifted
 from examples.pose_graph.report import Result, plot, print_table, trial, write_tables
 from examples.pose_graph.sequences import Array, Walk, walks
-from examples.processes import isolated_environment, node_process, publisher_process
+from examples.processes import Process, isolated_environment, node_process, publisher_process
 from examples.publisher import IMAGE_TOPIC, INFO_TOPIC, ODOMETRY_TOPIC
 from examples.sources import add_source_flags, named_frames
 from pnv_core import load_describer
@@ -31,7 +34,7 @@ from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.rotations import quaternion_of
 
-_LATE_S, _LATEST_S = 4.0, 20.0  # the node may still work on the last frames
+_LATE_S = 4.0  # the node may still work on the last frames
 _SHARED = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
@@ -99,11 +102,11 @@ def recorded(walk: Walk, odometry: Array, with_depth: bool = False) -> Recording
     return recording
 
 
-def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[Recording, Array]:
-    """Play a walk through node and back end: what arrived and the corrected poses (n, 4, 4)."""
+def live(walk: Walk, odometry: Array, assignments: Sequence[str] = ()) -> tuple[Recording, Array]:
+    """Play a walk through place_recognizer and tf_bridge: what was said, and tf_bridge's poses (n, 4, 4)."""
     environment = isolated_environment()
     rclpy.init(args=[])
-    back_end = BackEndNode(graph_of(walk.noise))
+    follower = Follower()
     parameters = {"image_topics": [IMAGE_TOPIC], "odometry_topic": ODOMETRY_TOPIC, **walk.parameters}
     if walk.intrinsics:
         parameters["camera_info_topics"] = [INFO_TOPIC]
@@ -113,29 +116,39 @@ def live(walk: Walk, odometry: Array, assignments: list[str]) -> tuple[Recording
         flags = [*walk.flags, "--playback", str(walk.playback), "--odometry", str(table)]
         if walk.intrinsics:
             flags += ["--intrinsics", ",".join(map(str, walk.intrinsics))]
+        bridge_parameters = {
+            "odometry_topic": ODOMETRY_TOPIC, "graph_path": str(Path(folder) / "graph.g2o"), "node_m": 0.1,
+            "tolerance_m": walk.noise.tolerance_m, "tolerance_deg": walk.noise.tolerance_deg,
+            "publish_tf": find_spec("tf2_msgs") is not None,
+        }  # fmt: skip
         try:
             with (
+                node_process(environment, bridge_parameters, (), None, executable="tf_bridge") as bridge,
                 node_process(environment, parameters, assignments, None) as node,
-                publisher_process(environment, flags) as publisher,
             ):
-                ended, late = None, _LATEST_S
-                while ended is None or time.monotonic() - ended < late:
-                    rclpy.spin_once(back_end, timeout_sec=0.1)
-                    late = _LATE_S if len(back_end.back_end.stamps) == len(walk.stamps_ns) else _LATEST_S
-                    if node.return_code is not None:
-                        raise PnvError(f"the node ended with {node.return_code}:\n" + "\n".join(node.lines[-15:]))
-                    if ended is None and publisher.return_code is not None:
-                        ended = time.monotonic()
-                if publisher.return_code:
-                    raise PnvError("\n".join(line for line in publisher.lines if not line.startswith("{")))
-            back_end.correct(everything=True)
-            if len(back_end.back_end.stamps) != len(walk.stamps_ns):
-                count = len(back_end.back_end.stamps)
-                raise PnvError(f"{walk.name}: {count} of {len(walk.stamps_ns)} odometry messages arrived")
-            return back_end.back_end.recording, back_end.back_end.graph.poses
+                _spin(follower, [bridge, node], lambda: any("corrects" in line for line in bridge.lines))
+                with publisher_process(environment, flags) as publisher:
+                    _spin(follower, [bridge, node], lambda: publisher.return_code is not None)
+                    if publisher.return_code:
+                        raise PnvError("\n".join(line for line in publisher.lines if not line.startswith("{")))
+                end = time.monotonic() + _LATE_S
+                _spin(follower, [bridge, node], lambda: time.monotonic() > end)
+                print(f"{walk.name}: tf_bridge has {follower.settle()}", flush=True)
+            poses = between_nodes(walk.stamps_ns, odometry, follower.stamps_ns, follower.path)
+            return follower.recording, poses
         finally:
-            back_end.destroy_node()
+            follower.destroy_node()
             rclpy.try_shutdown()
+
+
+def _spin(follower: Follower, processes: Sequence[Process], done: Callable[[], bool]) -> None:
+    """Listen until `done`. Raises PnvError where a process ends."""
+    while not done():
+        rclpy.spin_once(follower, timeout_sec=0.1)
+        for process in processes:
+            if process.return_code is not None:
+                last = "\n".join(process.lines[-15:])
+                raise PnvError(f"the {process.name} ended with {process.return_code}:\n{last}")
 
 
 def _write_odometry(path: Path, stamps_ns: list[int], poses: Array) -> None:
