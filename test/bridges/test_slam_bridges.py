@@ -128,6 +128,33 @@ def test_hydra_gets_edges_from_the_query_to_the_match(listener):
     assert "ended: 10 sent, 1 without a measured pose" in bridge.output
 
 
+def test_covariances_that_are_none_and_a_restart_of_either_side_are_said_and_lose_nothing_that_was_sent(listener):
+    from pose_graph_tools_msgs.msg import PoseGraph
+
+    graphs = listener.collect(PoseGraph, "/external_loop_closures", 100)
+    with running("hydra_bridge", READY) as bridge:
+        recogniser = Recogniser(listener)
+        for query, wrong in ((40, np.nan), (41, np.inf), (42, -1.0)):
+            pose = type(METRIC)(METRIC.rotation, METRIC.translation, True, 30, np.diag([wrong] * 6))
+            recogniser.say(closure(query * S, 10 * S), pose)
+        bridge.wait_for("relative pose of 40.000 has no finite, positive covariance; passed over")
+        recogniser.say(closure(43 * S, 13 * S))
+        wait_until(lambda: len(graphs) == 1, 30, "the edge with a covariance")
+        for publisher in (recogniser.closures, recogniser.poses):
+            listener.node.destroy_publisher(publisher)
+        restarted = Recogniser(listener)
+        restarted.say(closure(44 * S, 14 * S))
+        wait_until(lambda: len(graphs) == 2, 30, "an edge of the recogniser that was restarted")
+        assert bridge.end(signal.SIGTERM) == 0
+    assert "Traceback" not in bridge.output
+    assert "ended: 2 sent, 3 without a measured pose, 3 poses without a usable covariance" in bridge.output
+    with running("hydra_bridge", READY) as bridge:  # gets the closures again that are kept for it, their poses not
+        Recogniser(listener).say(closure(45 * S, 15 * S))
+        wait_until(lambda: len(graphs) == 3, 30, "an edge of the bridge that was restarted")
+        assert bridge.end() == 0
+    assert [edge.key_from for graph in graphs for edge in graph.edges] == [43 * S, 44 * S, 45 * S]
+
+
 def test_swarm_slam_gets_closures_between_its_keyframes(listener):
     """cslam/src/back_end/decentralized_pgo.cpp: BetweenFactor(keyframe0, keyframe1, transform) where success is set."""
     from cslam_common_interfaces.msg import IntraRobotLoopClosure, KeyframeOdom

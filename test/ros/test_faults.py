@@ -66,7 +66,7 @@ def test_malformed_messages_cost_neither_the_node_nor_a_good_frame(listener, cap
         with capsys.disabled():
             print(f"\nmalformed: offered {offered} + {good} good, dealt with {survived}, in the second half "
                   f"memory {memory:.0f} -> {node.memory_mb():.0f} MB, {node.threads()} threads")  # fmt: skip
-        tally("malformed messages", offered + good, survived, offered + good - survived)
+        tally("12 malformed messages", offered + good, survived, offered + good - survived)
         assert survived == offered + good
         assert int(values["frames processed"]) >= good
         assert int(values["dropped: unusable"]) > offered // 3
