@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pnv_core.config import Config
+from pnv_core.describe.download import cache_folder
 from pnv_core.threads import Workers
 from pnv_core.verify.feature_codes import features_only, pack, packed, picture_of, unpack
 from pnv_core.verify.verifier import EpipolarCheck, hull_area
@@ -122,10 +123,14 @@ class XFeatVerifier:
     side = WIDTH
 
     def __init__(self, config: Config | None = None) -> None:
+        from pnv_core.networks.openvino_backend import fast_precisions
         from pnv_core.verify.xfeat import XFeat
 
         config = config or Config()
-        self._xfeat = XFeat(WIDTH, MOST, config.threads, config.trunk_precision)
+        precision = (
+            "bfloat16" if "BF16" in fast_precisions() else config.trunk_precision
+        )  # matched alike, twice as fast
+        self._xfeat = XFeat(WIDTH, MOST, config.threads, precision, cache_folder() / "openvino")
         self._features: OrderedDict[bytes, tuple[LocalFeatures, float]] = OrderedDict()
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:

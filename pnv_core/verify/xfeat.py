@@ -37,6 +37,7 @@ _LEAST_SCORE = 0.05  # of a corner, the authors' detection threshold
 _NEIGHBOURHOOD = 5  # pixels, in which a corner is the surest
 _TEXTURE = 1e-3  # standard deviation of a picture in [0, 1] that shows nothing
 _EPSILON = 1e-12
+_GRAPH = "1"  # to be counted up where the graph or its weights change: what older programs compiled is no longer read
 _SHAPES = 8  # graphs kept compiled, one per picture shape
 
 
@@ -76,10 +77,16 @@ def _weights() -> dict[str, NDArray[np.float32]]:
 class XFeat:
     """The network with its detection, compiled for the shapes of the pictures it meets."""
 
-    def __init__(self, width: int, most: int, threads: int = 0, precision: str = "float32") -> None:
-        """`width` pixels of a picture's longer side, at most `most` features; threads and precision as in Config."""
+    def __init__(
+        self, width: int, most: int, threads: int = 0, precision: str = "float32", cache: Path | None = None
+    ) -> None:
+        """`width` pixels of a picture's longer side, at most `most` features; threads and precision as in Config.
+
+        `cache` is a folder for what is compiled.
+        """
         self.width, self.most = width, most
-        self._compiled = lru_cache(maxsize=_SHAPES)(lambda *shape: Compiled(lambda: _graph(*shape), threads, precision))
+        self._settings, self._cache = (threads, precision), cache
+        self._compiled = lru_cache(maxsize=_SHAPES)(self._compile)
 
     def features(self, grey: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> LocalFeatures:
         """(h, w), optionally bool of the pixels to use -> the features, the surest first."""
@@ -104,6 +111,10 @@ class XFeat:
         aspect = grey.shape[0] / grey.shape[1]
         points = np.stack([(x[best] + 0.5) / cols, (y[best] + 0.5) / rows * aspect], 1)
         return LocalFeatures(points.astype(np.float32), found)
+
+    def _compile(self, rows: int, cols: int) -> Compiled:
+        kept = None if self._cache is None else self._cache / f"xfeat_{_GRAPH}_{rows}x{cols}"
+        return Compiled(lambda: _graph(rows, cols), *self._settings, kept)
 
     def _sized(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The longer side `width`, the shorter within 16 pixels of what keeps the aspect."""

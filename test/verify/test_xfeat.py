@@ -13,6 +13,7 @@ from safetensors.numpy import load_file
 from pnv_core.errors import ModelError
 from pnv_core.images import read_image
 from pnv_core.networks.torch_backend import TorchNetwork
+from pnv_core.verify.local_features import match
 from pnv_core.verify.xfeat import NETWORK, WEIGHTS, XFeat
 from pnv_lab.xfeat import converted, published_weights
 
@@ -66,6 +67,16 @@ def test_the_features_are_those_of_the_authors_detection(published, pictures):
         ours, other = (np.array(numbers) for numbers in zip(*both, strict=True))
         cosine = (found.descriptors[ours] * theirs["descriptors"].numpy()[other]).sum(1)
         assert cosine.min() > 0.98  # read bilinearly here, bicubically there
+
+
+def test_bfloat16_finds_and_describes_what_float32_does(pictures):
+    exact, short = (XFeat(320, MOST, 1, precision) for precision in ("float32", "bfloat16"))
+    for grey in pictures:
+        one, other = exact.features(grey), short.features(grey)
+        q, r, _ = match(one, other)
+        same = np.abs(one.points[q] - other.points[r]).max(1) < 1.5 / 320
+        assert same.sum() > 0.9 * len(one.points)
+        assert (one.descriptors[q[same]] * other.descriptors[r[same]]).sum(1).min() > 0.99
 
 
 def test_the_shipped_weights_are_the_published_ones(published):
