@@ -5,7 +5,7 @@ C channels, H x W pixels; one image at a time.
 
 import functools
 import hashlib
-import io
+import mmap
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -56,32 +56,39 @@ class Compiled:
             "ENABLE_CPU_PINNING": False,  # the camera's driver and the middleware want these cores as well
         }
         stamp = f"{ov.__version__} {settings}".encode()
-        found = _kept(kept, stamp, settings) if kept is not None else None
+        file, found = _kept(kept, stamp, settings) if kept is not None else (None, None)
         if found is None:
             found = ov.Core().compile_model(graph(), "CPU", settings)
             if kept is not None:
                 _keep(kept, stamp, found.export_model().getvalue())
         self._request = found.create_infer_request()
+        self._file = self._unread = file  # the library reads from it as long as it runs
 
     def __call__(self, *inputs: NDArray) -> list[NDArray[np.float32]]:
         """The outputs for contiguous inputs; arrays of the caller's own."""
         self._request.infer(list(inputs), share_inputs=True)
+        if self._unread is not None:  # the weights are laid out anew now; pages that are asked for again come back
+            self._unread.madvise(mmap.MADV_DONTNEED)
+            self._unread = None
         return [tensor.data.copy() for tensor in self._request.output_tensors]
 
 
-def _kept(path: Path, stamp: bytes, settings: dict[str, Any]) -> ov.CompiledModel | None:
-    """What `_keep` wrote with the same stamp; None for anything else."""
+def _kept(path: Path, stamp: bytes, settings: dict[str, Any]) -> tuple[mmap.mmap | None, ov.CompiledModel | None]:
+    """What `_keep` wrote with the same stamp, and the file mapped into memory that it reads from; None for else."""
     try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    digest, body = content[:_DIGEST], content[_DIGEST:]
-    if hashlib.sha256(stamp + body).digest() != digest:
-        return None
+        with path.open("rb") as file:
+            content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    except (OSError, ValueError):  # none, or an empty one
+        return None, None
+    body = np.frombuffer(content, np.uint8)[_DIGEST:]
+    digest = hashlib.sha256(stamp)
+    digest.update(body.data)
+    if digest.digest() != content[:_DIGEST]:
+        return None, None
     try:
-        return ov.Core().import_model(io.BytesIO(body), "CPU", settings)
-    except RuntimeError:  # from a processor that differs, say
-        return None
+        return content, ov.Core().import_model(ov.Tensor(body, shared_memory=True), "CPU", settings)
+    except (RuntimeError, TypeError):  # from a processor that differs, say; an older library takes no tensor
+        return None, None
 
 
 def _keep(path: Path, stamp: bytes, body: bytes) -> None:
