@@ -110,7 +110,11 @@ def _opened(args: argparse.Namespace, config: Config, cache: Path, root: Path) -
         dataset = open_dataset(args.dataset, root, args.split, rule)
     for note in dataset.notes:
         print(f"pnv: {dataset.name}: {note}", file=sys.stderr)
-    return dataset.first(args.queries)
+    dataset = dataset.first(args.queries)
+    if not dataset.answerable:
+        why = f": {rule.words()}" if dataset.sequence else ""
+        print(f"pnv: {dataset.name}: none of {len(dataset.queries)} queries has a true reference{why}", file=sys.stderr)
+    return dataset
 
 
 def _bag(args: argparse.Namespace, cache: Path, root: Path, rule: "SequenceRule") -> "Dataset":

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from datetime import datetime
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -223,6 +224,8 @@ def _targets(args: argparse.Namespace) -> Targets:
         folder = Path("out") / f"{name}-{datetime.now():%Y-%m-%d_%H-%M-%S}"
     if folder and folder.exists() and not folder.is_dir():
         raise ConfigError(f"--out {folder}: is a file; allowed: a folder")
+    if args.rrd and find_spec("rerun") is None:
+        raise ConfigError("--rrd needs the rerun SDK; allowed: after pip install rerun-sdk (extra rerun)")
     if (args.g2o or args.tum or args.rtabmap) and not args.poses:
         raise ConfigError("--g2o, --rtabmap and --tum write poses; allowed: together with --poses FILE")
     if not (args.radius_m > 0 and args.angle_deg > 0):
@@ -286,10 +289,8 @@ def _recorder(recognizer: "PlaceRecognizer") -> "RunRecorder":
 
 
 def _recording(target: Path, accept_score: float) -> "Recording":
-    try:
-        from pnv_lab.recording import Recording
-    except ImportError:
-        raise ConfigError("--rrd needs the rerun SDK; allowed: after pip install rerun-sdk (extra rerun)") from None
+    from pnv_lab.recording import Recording
+
     return Recording(target, accept_score)
 
 

@@ -71,6 +71,12 @@ def test_an_empty_result_says_why(walk, model, capsys):
     assert re.search(r"the best candidate scored [01]\.\d{3} and was refused as low_score", capsys.readouterr().out)
 
 
+def test_a_recording_is_refused_before_any_work_where_its_library_is_missing(walk, model, capsys, monkeypatch):
+    monkeypatch.setattr("pnv_cli.run.find_spec", lambda name: None)
+    assert main(["run", "walk/images", "--rrd", "r.rrd", "--weights", "/nowhere.safetensors"]) == 2
+    assert "pip install rerun-sdk" in capsys.readouterr().err  # and not that there is no such model
+
+
 @pytest.mark.parametrize("poses", ["named.csv", "way.tum", "euroc.csv"])
 def test_poses_of_every_layout_mean_the_same(walk, model, poses):
     command = ["run", "walk/images", "--out", "o", "--poses", poses, "--tum", "t.tum", "--pairs", "p.txt"]

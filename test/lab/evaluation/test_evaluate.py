@@ -297,6 +297,20 @@ def test_the_command_writes_tables_and_a_report_that_needs_no_network(
     assert "width=device-width" in page
 
 
+def test_a_walk_without_revisits_is_said_to_be_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = "frame,timestamp,x,y,z,yaw\n"
+    for i in range(4):
+        write(tmp_path / "images" / f"{i}.png", place(i))
+        rows += f"{i}.png,{i},{10 * i},0,0,0\n"
+    (tmp_path / "poses.csv").write_text(rows)
+    small = ["--image-width", "160", "--image-height", "112", "--patch-sizes", "2", "--threads", "1"]
+    given = ["--root", str(tmp_path), "--method", "netvlad", "--cache", str(tmp_path / "c"), *small]
+    assert main(["evaluate", *given, "--radius-m", "2"]) == 0
+    told = capsys.readouterr().err
+    assert "none of 4 queries has a true reference: at most 2 m away" in told
+    assert "at least 30 s older" in told
+
+
 @pytest.mark.parametrize(
     ("flags", "complaint"),
     [
