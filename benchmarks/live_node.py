@@ -172,6 +172,7 @@ def start(args: argparse.Namespace, caches: Path) -> tuple[float, float]:
     """Seconds from the start of the process to its second processed frame, and megabytes resident then."""
     setup = SETUPS[0]
     environment = {"XDG_CACHE_HOME": str(caches / "cache"), "PYTHONPYCACHEPREFIX": str(caches / "bytecode")}
+    environment["PYTHONDONTWRITEBYTECODE"] = ""  # or there is nothing to be warm from
     listener = Listener()
     closures = Latencies(listener)
     with camera(setup, args, 120), node(setup, environment, exclude_recent_s=0.0, **args.parameters) as process:
