@@ -9,7 +9,7 @@ from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
 from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
 from pnv_core.decide.gates import decided
-from pnv_core.decide.judge import Judge
+from pnv_core.decide.judge import AROUND, Judge
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
@@ -73,9 +73,9 @@ class PlaceRecognizer:
                 descriptor = replace(descriptor, thumbnail=kept, geometry=self.geometry_of(frame, kept))
         with self.timer.stage("retrieve"):
             recent_ns = int(self.config.exclude_recent_s * 1e9)
-            candidates = self.database.nearest(
-                descriptor.global_vector, self.config.candidates, frame.stamp_ns, recent_ns
-            )
+            most = max(self.config.candidates, AROUND)
+            around = self.database.nearest(descriptor.global_vector, most, frame.stamp_ns, recent_ns)
+            candidates = around[: self.config.candidates]
         limit = self.budget.affordable(len(candidates), self.config.time_budget_ms / 1e3)
         with self.timer.stage("rerank"), self.budget.taken(limit):
             tried = candidates[:limit]
@@ -84,7 +84,7 @@ class PlaceRecognizer:
             candidates = [(ref, similarity) for ref, similarity in candidates if ref.id not in gone]
             known = list(stored.values())
             query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
-            closures = self.judge.judge(query, descriptor, predecessor, candidates, known, self.config)
+            closures = self.judge.judge(query, descriptor, predecessor, candidates, known, self.config, around)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
@@ -103,11 +103,12 @@ class PlaceRecognizer:
         if self.config.verify:
             kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
             descriptor = replace(descriptor, thumbnail=kept)
-        candidates = self.database.nearest(descriptor.global_vector, self.config.candidates, _LATEST_NS, 0)
+        around = self.database.nearest(descriptor.global_vector, max(self.config.candidates, AROUND), _LATEST_NS, 0)
+        candidates = around[: self.config.candidates]
         stored = self.database.readable(ref.id for ref, _ in candidates)
         candidates = [(ref, similarity) for ref, similarity in candidates if ref.id in stored]
         query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
-        closures = self.judge.judge(query, descriptor, 1.0, candidates, list(stored.values()), self.config)
+        closures = self.judge.judge(query, descriptor, 1.0, candidates, list(stored.values()), self.config, around)
         alone = SequenceMemory(self.database.steps)
         return sorted((decided(c, self.config, alone) for c in closures), key=self.judge.order)
 

@@ -26,20 +26,32 @@ Array = NDArray[np.float64]
 CHANCE = 8  # as many local features agree on some epipolar geometry by chance
 _LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
 _FEW_MATCHES = 40  # of fewer the share means little
+_FEW_INLIERS = 4
 
 
 def support(evidence: Evidence) -> float:
     """The share of the mutual local matches that agree, times the square of the spatial score, as a logarithm.
 
-    Neither tells look-alike corridors from a place by night: they agree in as many features, and their patches agree
-    as well as those of a place by night; but not in both at once.
+    What serves a model without a calibration of its own: how similar its other places are says nothing yet.
     """
     agreeing = max(evidence.local_inliers - CHANCE / 2, 1.0) / max(evidence.local_matches, _FEW_MATCHES)
     return math.log(agreeing) + 2.0 * math.log(max(evidence.spatial, 0.01) / 0.01)
 
 
-# Every feature grows with the belief in the candidate. Where local features speak one feature serves: with more of
-# them, fitted on some sets and judged on others, look-alike corridors pass.
+def agreement(evidence: Evidence) -> float:
+    """Log odds, but for a slope and a bias, that local features, patches and the rest of the map give a candidate.
+
+    Inliers alone do not part look-alike corridors from a place by night. How near the matches are, measured by how near
+    features of one image are to each other, does, and how alike the map's other places look. Free weights, fitted on
+    some sets and judged on others, let corridors pass; these are round numbers that serve on the places choices are
+    made on.
+    """
+    inliers, spatial = max(evidence.local_inliers, _FEW_INLIERS), max(evidence.spatial, 0.01)
+    likeness = min(evidence.likeness, 0.0)  # the tiles of a wall are nearer to each other than to their own image
+    return math.log(inliers) + 0.5 * math.log(spatial) + 3.0 * likeness - 6.0 * evidence.background
+
+
+# Every feature grows with the belief in the candidate.
 _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
     "patches": {
         "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
@@ -50,11 +62,12 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "recent_lead": lambda e: e.recent_lead,
         "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
     },
-    "verified": {"support": support},
+    "verified": {"agreement": agreement},
 }
-_OLDER: dict[str, dict[str, Callable[[Evidence], float]]] = {  # what files of other verifiers name
+_OLDER: dict[str, dict[str, Callable[[Evidence], float]]] = {  # what older files name
     "patches": {},
     "verified": {
+        "support": support,
         "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
         "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
         "local_inliers": lambda e: math.log(max(e.local_inliers, CHANCE) / CHANCE),

@@ -18,7 +18,6 @@ _STEP = 6  # keyframes of the other visit that may pass per keyframe of this one
 _MISSES = 2  # queries in the window that may lack a match on the path: a person in the way, a blurred image
 _FLOOR = 0.05  # a candidate below this score supports nothing
 PRIOR = 0.12  # P(same place) of a candidate on a path before its own frame is looked at; less speaks against it
-_WEIGHT = 0.35  # what the evidence of one frame counts: neighbouring frames err together
 _MISS = -0.7  # log odds, of a query without a match on the path
 _MOST = 3.0  # log odds, of one frame: a blurred image proves as little as a lucky one
 DOUBT = 4  # more keyframes must agree where a place elsewhere is supported alike: look-alike rooms are left sooner
@@ -80,7 +79,7 @@ class SequenceMemory:
             at, length, steps = best.match, length + 1, 1
         if not moved:  # the other visit stood still
             length, total, here = 1, 0.0, _evidence(closure.score)
-        return Path(length, _probability(_log_odds(PRIOR) + _WEIGHT * (total + here)), way if moved else 0)
+        return Path(length, _probability(_log_odds(PRIOR) + total + here), way if moved else 0)
 
     def _follows(self, earlier: ImageRef, later: ImageRef, way: int, queries: int) -> bool:
         """Whether `earlier` may be matched by the query `queries` before the one that matched `later`."""

@@ -14,6 +14,8 @@ from pnv_core.verify.reranker import Reranker, SpatialResult
 from pnv_core.verify.verifier import VERIFIERS, hull_area
 
 _NEIGHBOURS = 10  # keyframes of a sequence this close to each other show one place
+AROUND = 50  # most similar keyframes to be known for the background
+_BACKGROUND = 5  # the first few elsewhere may be the place itself on another lap
 
 Candidate = tuple[ImageRef, float]  # keyframe, similarity
 
@@ -36,10 +38,12 @@ class Judge:
         candidates: Sequence[Candidate],
         references: Sequence[PlaceDescriptor],
         config: Config,
+        around: Sequence[Candidate] = (),
     ) -> list[LoopClosure]:
         """A LoopClosure per candidate, best first, none accepted yet.
 
-        `references` is what is stored of the first candidates; the others are refused as not re-ranked.
+        `references` is what is stored of the first candidates; the others are refused as not re-ranked. `around` are
+        the AROUND most similar keyframes, best first; where not given, the candidates themselves.
         `predecessor` is the cosine of the query and the keyframe before it (1 if there is none); the
         `config.verify` best are examined by local features where both images have a thumbnail; where one has none, the
         evidence is missing and the calibration of patches alone decides. An image with less
@@ -61,6 +65,7 @@ class Judge:
                 spatial_lead=min((result.score - scored[i].score for i in elsewhere if i < len(scored)), default=0.0),
                 texture=min(descriptor.texture, reference.texture),
                 local_inliers=-1 if reference.thumbnail else NO_PICTURE,
+                background=self._background(ref, around or candidates),
             )
             found.append((self._closure(query, ref, evidence, result, config.min_texture), evidence, number))
         found.sort(key=lambda pair: self.order(pair[0]))
@@ -80,6 +85,7 @@ class Judge:
                     local_inliers=check.inliers,
                     local_spread=check.spread,
                     local_matches=len(check.inlier),
+                    likeness=check.likeness,
                 )
                 verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
                 found[place] = verified, seen, number
@@ -93,6 +99,11 @@ class Judge:
 
     def _apart(self, a: ImageRef, b: ImageRef) -> bool:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
+
+    def _background(self, match: ImageRef, around: Sequence[Candidate]) -> float:
+        """How similar other places of the map are to the query: the fifth one elsewhere, the last of fewer."""
+        elsewhere = [similarity for ref, similarity in around if self._apart(ref, match)]
+        return (elsewhere[:_BACKGROUND] or [around[-1][1]])[-1]
 
     def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:
         """With the most support that any other place of the match's own sequence has."""

@@ -5,9 +5,11 @@ N = features of an image, M = matches.
 
 import contextlib
 import io
+import math
 from collections import OrderedDict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -29,6 +31,7 @@ _QUALITY = 85
 _RATIO = 0.9  # Lowe 2004, section 7.1; plain mutual neighbours agree in look-alike corridors by the hundred
 _TWIN = 0.965  # cosine to a second feature from which on a look occurs twice: tiles of a wall
 _TOLERANCE_PX = 1.5
+_MOST_LIKE = 2.0
 _LEAST = 8  # points that determine a fundamental matrix
 _CACHED = 64  # images whose features are kept, about 0.2 MB each
 
@@ -39,6 +42,16 @@ class LocalFeatures:
 
     points: NDArray[np.float32]
     descriptors: NDArray[np.float32]
+
+    @cached_property
+    def own_distance(self) -> float:
+        """How far apart (1 - cosine) a feature and the most similar other one of the image are, on average.
+
+        Small where the image repeats itself, or is blurred. Two features at least.
+        """
+        similarity = self.descriptors @ self.descriptors.T
+        np.fill_diagonal(similarity, -1.0)
+        return 1.0 - float(similarity.max(1).mean())
 
 
 def no_features(dim: int) -> LocalFeatures:
@@ -94,7 +107,21 @@ def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float
     a, b = query.points[q], reference.points[r]
     inlier = np.zeros(len(q), bool)
     inlier[distinct] = _epipolar_inliers(a[distinct] * WIDTH, b[distinct] * WIDTH)
-    return EpipolarCheck(a, b, inlier, min(hull_area(a[inlier]), hull_area(b[inlier])) / aspect)
+    spread = min(hull_area(a[inlier]), hull_area(b[inlier])) / aspect
+    return EpipolarCheck(a, b, inlier, spread, _likeness(query, reference, q, r))
+
+
+def _likeness(query: LocalFeatures, reference: LocalFeatures, q: NDArray[np.int64], r: NDArray[np.int64]) -> float:
+    """As EpipolarCheck has it, of the matches q, r; within 2 of 0, and -2 without matches.
+
+    Lowe's ratio of the whole images, with each image's own features in the place of the second best: light changes both
+    distances alike, and look-alike corridors are nearer to themselves than to one another.
+    """
+    if not len(q):
+        return -_MOST_LIKE
+    matched = 1.0 - float((query.descriptors[q] * reference.descriptors[r]).sum(1).mean())
+    own = (query.own_distance + reference.own_distance) / 2
+    return max(-_MOST_LIKE, min(_MOST_LIKE, math.log(max(own, 1e-6) / max(matched, 1e-6))))
 
 
 def _epipolar_inliers(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -18,13 +18,16 @@ from pnv_core.threads import Workers
 class EpipolarCheck:
     """Matched points (M, 2) of two images in units of their widths, and which (M,) agree on one geometry.
 
-    `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both.
+    `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both. `likeness` is the log
+    of how far apart the most similar features of one image are over how far apart matched features are: high where
+    matches are sure, low where the images repeat themselves.
     """
 
     query: NDArray[np.float32]
     reference: NDArray[np.float32]
     inlier: NDArray[np.bool_]
     spread: float
+    likeness: float = 0.0
 
     @property
     def inliers(self) -> int:

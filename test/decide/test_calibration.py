@@ -33,13 +33,17 @@ CONFIG = Config.make(
 
 
 def drawn(rng, n, examined=True):
-    """Evidence whose truth follows a logistic law in the share of local inliers and the spatial score."""
+    """Evidence whose truth follows a logistic law in what local features, patches and other places say."""
     found = []
     for _ in range(n):
         inliers, spatial = int(rng.integers(8, 60)), float(rng.uniform(0.02, 0.4))
-        matches = int(rng.integers(inliers, 250))
-        logit = 4.0 + 1.5 * np.log((inliers - 4) / max(matches, 40)) + 3.0 * (np.log(spatial) + 2)
-        e = Evidence(0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_matches=matches)
+        matches, likeness, background = int(rng.integers(inliers, 250)), rng.uniform(-1.5, 0), rng.uniform(0.1, 0.6)
+        agreeing, likely, rare = np.log(inliers * np.sqrt(spatial) / 9), 3 * (likeness + 0.7), 6 * (0.3 - background)
+        logit = 1.2 * (agreeing + likely + rare)
+        e = Evidence(
+            0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_matches=matches,
+            likeness=float(likeness), background=float(background),
+        )  # fmt: skip
         found.append((e, bool(rng.random() < 1 / (1 + np.exp(-logit))), 1 / (1 + np.exp(-logit))))
     return found
 
@@ -60,7 +64,7 @@ def test_the_fit_finds_the_probability_the_examples_were_drawn_with():
         [
             f.name
             for f in dataclasses.fields(Evidence)
-            if f.name not in ("texture", "distortion", "inliers", "local_matches")
+            if f.name not in ("texture", "distortion", "inliers", "local_matches", "background")
         ]
     ),
     st.floats(0, 1),
@@ -75,7 +79,11 @@ def test_more_of_any_evidence_never_lowers_the_score(name, step, seed):
     raised = dataclasses.replace(e, **{name: getattr(e, name) + more})
     for calibration in (fitted, CONSERVATIVE):
         assert calibration.probability(raised) >= calibration.probability(e) - 1e-12
-        for against in ({"distortion": e.distortion + step}, {"local_matches": e.local_matches + round(step * 40)}):
+        for against in (
+            {"distortion": e.distortion + step},
+            {"local_matches": e.local_matches + round(step * 40)},
+            {"background": e.background + step},
+        ):
             assert calibration.probability(dataclasses.replace(e, **against)) <= calibration.probability(e) + 1e-12
 
 
@@ -125,7 +133,7 @@ def test_the_calibration_lives_in_the_model_file_and_leaves_the_model_as_it_is(t
     save_model(small_model(), path)
     before = load_model(path)
     calibration = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"support": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"agreement": 3.0}), "ransac", (2, 3), (320, 240), "a test",
         verifier="xfeat",
     )  # fmt: skip
     write_calibration(path, calibration)
@@ -181,7 +189,7 @@ def test_a_malformed_calibration_is_refused(change):
 
 def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilities_and_what_it_is_for_is_said():
     right = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"support": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"agreement": 3.0}), "ransac", (2, 3), (320, 240), "a test",
         verifier="xfeat",
     )  # fmt: skip
     evidence = [e for e, _, _ in drawn(np.random.default_rng(0), 20)]

@@ -162,8 +162,8 @@ def test_weak_evidence_that_agrees_becomes_belief_and_alone_it_does_not():
             closures = [closure(query, m, s) for m, s in matches]
             memory.remember("front", closures, window)
         beliefs.append(memory.path(closures[0], window).belief)
-    assert beliefs[0] < 0.3
-    assert beliefs[1] > 0.5
+    assert beliefs[0] == pytest.approx(0.4)  # what the frame says by itself
+    assert beliefs[1] > 0.9
 
 
 @given(st.lists(st.floats(0.06, 0.94), min_size=5, max_size=5), st.integers(0, 4))

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pnv_core.config import Config
 from pnv_core.decide.odometry import Odometry, Refusal
 from pnv_core.types import ImageRef
 from test.tally import count, tally
@@ -141,3 +142,24 @@ def test_a_camera_in_front_of_the_robot_moves_when_the_robot_turns():
     odometry.add(S, 0.0, 0.0, 0.0, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)))  # a quarter to the left
     assert odometry.at(0).of((0.5, 0.1, 0.2)) == pytest.approx((0.5, 0.1, 0.2))
     assert odometry.at(S).of((0.5, 0.1, 0.2)) == pytest.approx((-0.1, 0.5, 0.2))
+
+
+def test_height_tells_the_floors_of_a_tower_apart_where_odometry_is_trusted_to_two_percent():
+    """Twelve metres of corridor and 3.5 m up by stairs of 8 m: the same spot on every floor."""
+    odometry, floors = Odometry(), []
+    for floor in range(6):
+        for step in range(20):
+            stair = max(step - 12, 0) / 8
+            second = 20 * floor + step
+            x = float(step) if step <= 12 else 12.0 * (1 - stair)
+            odometry.add(second * S, x, 0.0, 3.5 * (floor + stair))
+            ref = ImageRef(second, second * S, "front")
+            odometry.remember(ref)
+            if step == 6:
+                floors.append(ref)
+    pairs = [(later, earlier) for i, later in enumerate(floors) for earlier in floors[:i]]
+    trusted = {"drift": 0.02, "slack_m": 2.0, "least_way_m": 1.0}
+    assert all(odometry.impossible(*pair, **trusted) for pair in pairs)
+    default = Config()
+    gate = default.odometry_drift, default.odometry_slack_m, default.min_travelled_m
+    assert not any(odometry.impossible(*pair, *gate) for pair in pairs)

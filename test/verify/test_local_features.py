@@ -89,3 +89,24 @@ def test_a_sliver_of_an_image_stays_small(shape):
     picture = cv2.imdecode(np.frombuffer(thumbnail(rgb), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert picture.size <= 320 * 1280
     assert (VERIFIER.features(VERIFIER.keep(rgb, "front"))[0].points <= 4.0).all()
+
+
+def test_likeness_is_that_of_a_plain_search_and_parts_a_place_in_another_light_from_other_places():
+    """The distance of a feature to its own image's most similar one, over that of mutual nearest neighbours."""
+
+    def plain(one, other):
+        apart = 1 - one.descriptors.astype(float) @ other.descriptors.astype(float).T
+        q, r = apart.argmin(1), apart.argmin(0)
+        matched = np.mean([apart[i, q[i]] for i in range(len(q)) if r[q[i]] == i])
+        own = []
+        for image in (one, other):
+            to_own = 1 - image.descriptors.astype(float) @ image.descriptors.astype(float).T
+            own.append(np.mean([min(np.delete(row, i)) for i, row in enumerate(to_own)]))
+        return np.log(np.mean(own) / matched)
+
+    dark = (view(scene(0), (12, 5), 1.05) * 0.35).astype(np.uint8)
+    again, elsewhere = (epipolar_check(features(scene(0)), features(image), 0.75) for image in (dark, scene(51)))
+    for check, image in ((again, dark), (elsewhere, scene(51))):
+        assert check.likeness == pytest.approx(plain(features(scene(0)), features(image)), abs=1e-3)
+    assert again.likeness > elsewhere.likeness + 0.3
+    assert epipolar_check(features(np.zeros_like(dark)), features(dark), 0.75).likeness == -2.0
