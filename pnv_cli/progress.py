@@ -24,6 +24,8 @@ def bar(items: Iterable[Any] | None = None, **options: Any) -> Any:
     """tqdm with the given options."""
     if sys.stderr.isatty():
         return tqdm(items, file=sys.stderr, **{"mininterval": 0.2, "leave": False} | options)
+    if said := options.get("desc"):
+        options["desc"] = said.rstrip(": ") + ": "
     shape = "{desc}{n_fmt} of {total_fmt} {unit}s in {elapsed}"
     every = dict.fromkeys(("mininterval", "maxinterval", "delay"), _EVERY_S)
     plain = {"file": _Lines(), "leave": False, "bar_format": shape}

@@ -31,7 +31,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _fetch(args: argparse.Namespace) -> int:
-    with bar(unit="B", unit_scale=True, desc=f"{args.name} ") as shown:
+    with bar(unit="B", unit_scale=True, desc=args.name) as shown:
 
         def progress(done: int, total: int) -> None:
             shown.total = total or None

@@ -255,11 +255,12 @@ def test_the_version_is_that_of_the_package(capsys):
     assert f'version="{stated.group(1)}"' in (ROOT / "setup.py").read_text()
 
 
-def test_progress_off_a_terminal_is_lines_without_carriage_returns(capsys, monkeypatch):
+@pytest.mark.parametrize("desc", ["frames", "frames: "])
+def test_progress_off_a_terminal_is_lines_without_carriage_returns(desc, capsys, monkeypatch):
     from pnv_cli import progress
 
     monkeypatch.setattr(progress, "_EVERY_S", 0.0)
-    assert list(progress.bar(range(3), desc="frames: ", unit="frame")) == [0, 1, 2]
+    assert list(progress.bar(range(3), desc=desc, unit="frame")) == [0, 1, 2]
     told = capsys.readouterr().err
     assert "\r" not in told
     assert re.search(r"frames: \d of 3 frames in 00:00\n", told)
