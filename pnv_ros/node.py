@@ -21,6 +21,7 @@ from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.rotations import mount_of
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
+from pnv_core.verify.local_features import KEPT_BYTES
 from pnv_ros.companions import Companions
 from pnv_ros.diagnostics import Diagnostics
 from pnv_ros.fleet import start_fleet
@@ -192,7 +193,7 @@ class PlaceRecognizerNode(LifecycleNode):
         database = KeyframeDatabase.for_describer(describer, read_only=config.localization)
         recognizer = PlaceRecognizer(describer, database, timer=StageTimer(time.perf_counter))
         like = _warm_up(describer)
-        per_keyframe = database.bytes_per_keyframe(like)
+        per_keyframe = database.bytes_per_keyframe(like) + (KEPT_BYTES if self.settings.recogniser.verify else 0)
         if per_keyframe > database.bytes_budget:
             raise ConfigError(
                 f"memory_budget_mb = {self.settings.recogniser.memory_budget_mb:g} holds no keyframe; "
@@ -251,7 +252,7 @@ class PlaceRecognizerNode(LifecycleNode):
                 f"  network      {describer.backend}, {config.trunk_precision}, {config.threads or 'all'} threads",
                 f"  preset       {config.preset}: {config.image_width}x{config.image_height} px, patches "
                 f"{', '.join(map(str, config.patch_sizes))}, {config.scorer}, accepted from {config.accept_score:g}",
-                f"  memory       {per_keyframe / 1e6:.3f} MB per keyframe, {config.memory_budget_mb:g} MB for "
+                f"  memory       {per_keyframe / 1e6:.2f} MB per keyframe, {config.memory_budget_mb:g} MB for about "
                 f"{int(budget // per_keyframe)} keyframes",
             ]
         )

@@ -25,6 +25,7 @@ from pnv_core.verify.verifier import EpipolarCheck, hull_area
 
 WIDTH = 640  # pixels of the longer side; night against day needs it
 MOST = 500  # features: 34 kB a keyframe
+KEPT_BYTES = 68 * MOST + 8_000  # of a keyframe: features, and a small picture of usual size
 _SMALL = 320  # pixels of the picture kept for people
 _TALLEST = 4 * _SMALL
 _QUALITY = 85
