@@ -71,7 +71,7 @@ def _renamed(content: Any, source: str) -> Tensors:
         "WPCA.0.weight": "global_projection.weight",
         "WPCA.0.bias": "global_projection.bias",
     }
-    tensors: Tensors = {}
+    tensors: dict[str, Any] = {}
     shapes = {}
     unexpected = []
     for given, tensor in state.items():

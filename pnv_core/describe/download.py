@@ -4,13 +4,10 @@ Facts of the published files: Patch-NetVLAD repository, download_models.py, and 
 """
 
 import hashlib
-import http.client
 import json
 import os
 import shutil
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -151,6 +148,10 @@ def _record(item: Published) -> Path:
 
 def _download(url: str, part: Path, progress: Callable[[int, int], None]) -> int:
     """Append what is missing of `url` to `part`; the full size in bytes, 0 if unknown."""
+    import http.client  # a robot that has its model waits for neither
+    import urllib.error
+    import urllib.request
+
     have = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={have}-"} if have else {})
     try:

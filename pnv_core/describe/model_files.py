@@ -5,7 +5,7 @@ K clusters, C channels, D dimensions.
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -27,7 +27,35 @@ _MOST_TEXT = 100_000  # characters of a text in the metadata
 _MOST_SIZES = 16
 OPTIONAL = ("patch_projection", "pooled_projection")
 
-Tensors = dict[str, NDArray[np.float32]]
+Tensors = Mapping[str, NDArray[np.float32]]
+
+
+class _Stored(Mapping[str, NDArray[np.float32]]):
+    """The tensors of a file, read when they are asked for: once it is compiled, a network needs them no more."""
+
+    def __init__(self, path: str) -> None:
+        """Raises what safetensors raises."""
+        self._path = path
+        self._file: Any = safe_open(path, framework="np")
+        self.metadata = self._file.metadata() or {}
+        self._names = sorted(self._file.keys())
+
+    def close(self) -> None:
+        """Until a tensor is asked for again."""
+        self._file = None
+
+    def __getitem__(self, name: str) -> NDArray[np.float32]:
+        if name not in self._names:
+            raise KeyError(name)
+        if self._file is None:
+            self._file = safe_open(self._path, framework="np")
+        return np.ascontiguousarray(self._file.get_tensor(name), np.float32)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
 
 
 @dataclass(frozen=True)
@@ -69,7 +97,7 @@ class Model:
     def has(self, part: str) -> bool:
         return any(name.startswith(f"{part}.") for name in self.tensors)
 
-    @property
+    @cached_property
     def clusters(self) -> int:
         return len(self.tensors["netvlad.centroids"])
 
@@ -78,14 +106,19 @@ class Model:
         """The part that projects patches."""
         return "patch_projection" if self.has("patch_projection") else "global_projection"
 
-    @property
+    @cached_property
     def global_dim(self) -> int:
         pooled = len(self.tensors["pooled_projection.bias"]) if self.has("pooled_projection") else 0
         return len(self.tensors["global_projection.bias"]) + pooled
 
-    @property
+    @cached_property
     def patch_dim(self) -> int:
         return len(self.tensors[f"{self.patches_projection}.bias"])
+
+    def release(self) -> None:
+        """Give back the memory of tensors that a file has; they are read again where somebody asks for them."""
+        if isinstance(self.tensors, _Stored):
+            self.tensors.close()
 
     def fingerprint(self) -> str:
         """sha256 over the tensors, the trunk's name and the pooled share: equal fingerprints describe alike."""
@@ -103,7 +136,9 @@ class Model:
 
 def build_model(info: ModelInfo, tensors: Mapping[str, NDArray], source: str) -> Model:
     """A Model from named tensors; K, C and D come from the shapes. Raises ModelError naming `source` and the fault."""
-    model = Model(info, {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()})
+    if not isinstance(tensors, _Stored):
+        tensors = {name: np.ascontiguousarray(tensor, np.float32) for name, tensor in tensors.items()}
+    model = Model(info, tensors)
     parts = {name.partition(".")[0] for name in tensors}
     required = {"netvlad", "global_projection"}
     if parts - {"trunk", *OPTIONAL} != required:
@@ -167,13 +202,14 @@ def load_model(path: Path | str) -> Model:
     """Read a model file. Raises ModelError for anything else, naming what is wrong."""
     source = str(path)
     try:
-        with safe_open(source, framework="np") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+        tensors = _Stored(source)
+        for name in tensors:  # one of another kind of number is refused here
+            _ = tensors[name]
     except FileNotFoundError:
         raise ModelError(f"{source}: no such model file") from None
     except (SafetensorError, OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise ModelError(f"{source}: not a readable safetensors file ({error})") from None
+    metadata = tensors.metadata
     if metadata.get("format") != FORMAT:
         raise ModelError(f"{source}: format {metadata.get('format')!r}; allowed: {FORMAT!r}")
     info = _info(metadata, source)

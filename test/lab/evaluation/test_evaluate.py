@@ -187,7 +187,7 @@ def test_memory_stays_bounded(dataset: Dataset, tmp_path: Path) -> None:
 def test_leading_dimensions_are_the_smaller_projection() -> None:
     full = load_describer(image_width=160, image_height=112, patch_sizes=(2,), patch_precision="float32")
     small = {name: t[:16] for name, t in full.model.tensors.items() if name.startswith("patch_projection.")}
-    cut = Describer(Model(full.model.info, full.model.tensors | small), full.config)
+    cut = Describer(Model(full.model.info, {**full.model.tensors, **small}), full.config)
     expected = cut.describe(place(3)).patches[0].descriptors
     given = leading(full.describe(place(3)).patches[0].descriptors, 16)
     np.testing.assert_allclose(given, expected, atol=2e-5)
