@@ -221,9 +221,25 @@ def stalled(keyframes: int, folder: Path, dim: int = 512) -> dict[str, Ticks]:
     rng = np.random.default_rng(0)
     places = [place(rng, dim, 676) for _ in range(64)]
     database = KeyframeDatabase(dim, keyframes * 0.11)
-    for i in range(keyframes):
-        database.add(i * SECOND, "front", places[i % 64])
     store, found = MapStore(folder / "map", "0" * 16), {}
+
+    def drive() -> None:
+        for i in range(keyframes):
+            database.add(i * SECOND, "front", places[i % 64])
+
+    turns = []
+    for _ in range(3):  # only where memory was in use before does a block lie so
+        drive()
+        above = [np.ones(8000) for _ in range(50)]  # as arrays of a frame, which lie above the map in memory
+        with Ticks() as ticks:
+            database.clear()
+        turns.append(ticks)
+        with Ticks() as ticks:
+            above.clear()
+            time.sleep(0.01)
+        turns.append(ticks)
+    found["forgotten below a frame"] = max(turns, key=lambda ticks: ticks.longest_own)
+    drive()
     with Ticks() as found["saved"]:
         store.save(database.snapshot())
     with Ticks() as found["read"]:

@@ -1,6 +1,7 @@
 """What of an image is looked at: mask, crop, rectification."""
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -61,7 +62,7 @@ class View:
 
 def read_mask(path: str) -> NDArray[np.uint8]:
     """(H, W) uint8, 0 where pixels are ignored and 255 elsewhere. Raises ConfigError for a file that is no mask."""
-    file = Path(path).expanduser()
+    file = Path(os.path.expanduser(path))
     if not file.is_file():
         raise ConfigError(f"mask {path!r} is no file; allowed: an image, black where pixels are ignored")
     try:

@@ -65,7 +65,7 @@ def resolve_weights(weights: str) -> Path:
                 f"weights {weights!r} are not on this machine ({path}); fetch them with: pnv weights fetch {weights}"
             )
         return path
-    path = Path(weights).expanduser()
+    path = Path(os.path.expanduser(weights))  # of pathlib: a RuntimeError for a user that is not there
     if not path.is_file():
         raise ModelError(
             f"weights {weights!r}: no such file; allowed: default, {', '.join(PUBLISHED)}, or a model file"

@@ -59,3 +59,9 @@ def test_a_stamp_outside_of_64_bits_is_refused(tmp_path, capsys):
 def test_a_number_that_is_not_finite_is_refused_whatever_the_flag(value, tmp_path, capsys):
     assert main(["map", "prune", str(tmp_path), "-o", str(tmp_path / "o"), f"--budget-mb={value}"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", ["~0", "~nobody of this name/x.safetensors"])
+def test_the_home_of_a_user_that_is_not_there_is_one_line(name, capsys):
+    assert main(["weights", "verify", name]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
