@@ -5,7 +5,7 @@ of the query's frame to R x + t. Scale is never made up: where depth is known at
 direction are given.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pnv_core.errors import ConfigError
-from pnv_core.rotations import cross_matrix, exponential, logarithm, quaternion_of, rigid
+from pnv_core.rotations import cross_matrix, exponential, inverse, inverted, logarithm, quaternion_of, rigid
 from pnv_core.verify.verifier import EpipolarCheck
 
 Array = NDArray[np.float64]
@@ -23,12 +23,15 @@ _LEAST = 12  # points a pose is taken from; five would determine it, chance agre
 _NOISE = 1.0 / 320  # a matched point is rarely further off, in image widths
 _LEAST_NOISE = 0.1 * _NOISE  # nor better than this, however well the points agree
 _SHARED_NOISE = 0.25 * _NOISE  # all points of an image may be off together: principal point, detector
-_LEAST_PARALLAX = 1.0  # noises; where nearly all points move less beside a turn, the direction cannot be told
-_LARGE_SHARE = 0.8
-_LARGEST_DOUBT = 0.5  # radians: a direction less certain than this is none
+_LARGEST_DOUBT = 0.5  # radians of a direction, or of a scale's logarithm: one less certain than this is none
+_HALVES, _MOST_FAILED = 24, 6  # halves of the matches that are solved, and how many of them may show nothing
+_LEAST_HALF = 8  # points; five determine an essential matrix
+_LEAST_SHARED = 5  # points seen in three views, for a scale
 _NEAR, _FAR = 0.05, 100.0  # metres; depths outside are no measurement
 _FOCAL = 500.0  # of the common camera that OpenCV's thresholds are in pixels of
-_TOLERANCES = 0.3, 0.9  # of the search for an essential matrix, in noises
+_TOLERANCE = 0.3  # of the search for an essential matrix, in noises
+_CONFIDENCE, _SAMPLES = 0.99, 1000
+_FARTHEST = 1000.0  # ways between the views; a point beyond says nothing of which side is ahead
 _AGREEING = 3.0
 _ITERATIONS, _STILL = 20, 1e-5
 _CAUCHY = 2.385  # 95 % efficiency (Zhang 1997)
@@ -93,6 +96,11 @@ class RelativePose:
         """(x, y, z, w)."""
         return quaternion_of(self.rotation)
 
+    def inverse(self) -> "RelativePose":
+        """The match's camera in the frame of the query's; of a metric pose."""
+        back, covariance = inverse(self.matrix), inverted(self.covariance, self.matrix)
+        return replace(self, rotation=back[:3, :3], translation=back[:3, 3], covariance=covariance)
+
 
 def relative_pose(
     check: EpipolarCheck,
@@ -110,19 +118,45 @@ def relative_pose(
     """
     if len(check.query) < _LEAST:
         return None
-    rays, depths = (query.rays(check.query), match.rays(check.reference)), (query_depth, match_depth)
-    here, there = (_known(check, depth) for depth in depths)
-    sight = _Sight(*rays, here, there, _NOISE / query.fx, _NOISE / match.fx)[_distinct(check)]
-    return _metric(sight, scale_error) or _direction(sight)
+    rays = query.rays(check.query), match.rays(check.reference)
+    here, there = (_known(check, depth) for depth in (query_depth, match_depth))
+    sight = _Sight(*rays, here, there, _NOISE / query.fx, _NOISE / match.fx)
+    return _metric(sight, scale_error) or _direction(check, query, match)
 
 
-def _distinct(check: EpipolarCheck) -> NDArray[np.int64]:
-    """One match of each point: a detector gives a point once per orientation, which is no further evidence."""
-    pixels = np.rint(np.hstack([check.query, check.reference]) * (2 / _NOISE)).astype(np.int64)
-    chosen = np.arange(len(pixels))
-    for side in (pixels[:, :2], pixels[:, 2:]):
-        chosen = np.intersect1d(chosen, np.unique(side, axis=0, return_index=True)[1])
-    return chosen
+def pose_by_way(
+    check: EpipolarCheck,
+    beside: EpipolarCheck,
+    query: Intrinsics,
+    match: Intrinsics,
+    other: Intrinsics,
+    metres: float,
+    way_error: float,
+) -> RelativePose | None:
+    """The metric pose where only the length of the way from the query to a view `beside` it is known.
+
+    `beside` holds matches of the same query with that view, whose camera is `other`; points that both views share give
+    the ratio of the two ways. `way_error` is relative. None where it cannot be told.
+    """
+    if not metres > 0:
+        return None
+    pair, short = _Matched.of(check, query, match), _Matched.of(beside, query, other)
+    found = [(one.pose, two.pose, ratio) for one, two in _halves(pair, short) if (ratio := _ratio(one, two)) > 0]
+    if len(found) < _HALVES - _MOST_FAILED:
+        return None
+    mean, away = _spread([pose for pose, *_ in found])
+    beside_away = _spread([pose for _, pose, _ in found])[1]  # random where the robot stood, whatever its wheels say
+    logs = np.log([ratio for *_, ratio in found])
+    length = metres * float(np.exp(np.median(logs)))
+    covariance = _covariance(np.column_stack([away, logs - np.median(logs)]), pair.noise)
+    covariance[5, 5] += way_error**2
+    doubts = _doubt(covariance), _doubt(_covariance(beside_away, short.noise)), float(np.sqrt(covariance[5, 5]))
+    if max(doubts) > _LARGEST_DOUBT:
+        return None
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :2], jacobian[:3, 5], jacobian[3:, 2:5] = length * _across(mean[1]).T, length * mean[1], np.eye(3)
+    shared = int(np.isin(pair.points, short.points).sum())
+    return RelativePose(mean[0], length * mean[1], True, shared, jacobian @ covariance @ jacobian.T)
 
 
 def depth_at(depth: NDArray[np.floating], points: NDArray) -> Array:
@@ -152,14 +186,6 @@ def triangulated(check: EpipolarCheck, view: Intrinsics, beside: Intrinsics, mot
         moved = np.linalg.norm(u * z[:, None], axis=1) / np.abs(there[:, 2])  # parallax, in rays
         good = (z > _NEAR) & (z < _FAR) & (there[:, 2] > _NEAR) & (error < 2 * noise) & (moved > 4 * noise)
     return np.where(good, z, np.nan)
-
-
-def depth_by_way(check: EpipolarCheck, view: Intrinsics, beside: Intrinsics, metres: float) -> Array:
-    """(M,) depths in the first view of a check where only the way to the second is known; its direction is seen."""
-    pose = relative_pose(check, view, beside) if metres > 0 else None
-    if pose is None or not pose.translation.any():
-        return np.full(len(check.query), np.nan)
-    return triangulated(check, view, beside, rigid(pose.rotation, pose.translation * metres))
 
 
 def _known(check: EpipolarCheck, depth: Array | None) -> Array:
@@ -257,7 +283,7 @@ def _solved_twice(sight: _Sight, pose: Pose, known: NDArray[np.bool_]) -> tuple[
     bound: Array | float = _AGREEING
     for _ in range(2):
         agree = np.linalg.norm(sight.residuals(*pose), axis=1) < bound
-        solved = _solved(sight[agree], pose, _moved, 6) if (agree & known).sum() >= _LEAST else None
+        solved = _solved(sight[agree], pose) if (agree & known).sum() >= _LEAST else None
         if solved is None:
             return None
         pose, covariance, scale = solved
@@ -265,86 +291,133 @@ def _solved_twice(sight: _Sight, pose: Pose, known: NDArray[np.bool_]) -> tuple[
     return pose, covariance, int((agree & known).sum())
 
 
-def _direction(sight: _Sight) -> RelativePose | None:
-    """Rotation and direction of motion from the essential matrix, refined on the Sampson distance.
+@dataclass(frozen=True, eq=False)
+class _Matched:
+    """Distinct matches of two images: rays (M, 2) of both, which point of the first image each is of, the noise."""
 
-    Sought with a narrow and a wide tolerance. The solution that more of the matches agree with is taken; where the
-    other one explains them nearly as well, as on flat scenes, the difference becomes doubt.
-    """
-    unknown = np.full(len(sight), np.nan)
-    sight = replace(sight, za=unknown, zb=unknown)
-    starts = [found for tolerance in _TOLERANCES if (found := _essential(sight, tolerance)) is not None]
-    turned, still = _only_turned(sight)
-    most = max((start[0].sum() for start in starts), default=_LEAST)
-    if still.sum() >= max(_LEAST, _LARGE_SHARE * most):
-        return _turn(sight[still], turned)
-    solutions = [solved for start in starts if (solved := _refined(sight, *start)) is not None]
-    if not solutions:
-        return None
-    best, *others = sorted(solutions, key=lambda solved: solved.cost)
-    covariance = best.covariance.copy()
-    for other in others:
-        if other.cost <= 1.25 * best.cost + 2:
-            across = _across(best.pose[1])
-            away = np.append(across.T @ across @ other.pose[1], logarithm(other.pose[0] @ best.pose[0].T))
-            covariance += np.outer(away, away)
-    if np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > _LARGEST_DOUBT:
-        return None
-    return RelativePose(*best.pose, False, best.inliers, covariance)
+    a: Array
+    b: Array
+    points: NDArray[np.int64]
+    noise: float
+
+    @classmethod
+    def of(cls, check: EpipolarCheck, query: Intrinsics, match: Intrinsics) -> "_Matched":
+        distinct = np.ones(len(check.query), bool) if check.distinct is None else check.distinct
+        at, to = check.query[distinct], check.reference[distinct]
+        column, row = np.rint(np.asarray(at, np.float64).T * (1 << 20)).astype(np.int64)
+        noise = _NOISE * (1 / query.fx + 1 / match.fx) / 2
+        return cls(query.rays(at), match.rays(to), column * (1 << 30) + row, noise)
+
+    def __getitem__(self, chosen: NDArray) -> "_Matched":
+        return _Matched(self.a[chosen], self.b[chosen], self.points[chosen], self.noise)
+
+    def solved(self) -> "_Solved | None":
+        """The essential matrix that most matches agree on, by USAC with MAGSAC's scores (Barath et al., CVPR 2020)."""
+        if len(self.a) < _LEAST_HALF:
+            return None
+        a, b = (np.ascontiguousarray(rays * _FOCAL) for rays in (self.a, self.b))
+        camera, pixels = np.diag([_FOCAL, _FOCAL, 1.0]), _TOLERANCE * self.noise * _FOCAL
+        essential, mask = cv2.findEssentialMat(a, b, camera, cv2.USAC_MAGSAC, _CONFIDENCE, pixels, _SAMPLES)
+        if essential is None or essential.shape != (3, 3) or (agree := mask.ravel() > 0).sum() < _LEAST_SHARED:
+            return None
+        front = cv2.recoverPose(essential, a[agree], b[agree], camera, distanceThresh=_FARTHEST)
+        agree[agree] = front[3].ravel() > 0
+        return _Solved((front[1], front[2].ravel()), self[agree])
 
 
 @dataclass(frozen=True, eq=False)
-class _Direction:
+class _Solved:
+    """A pose with a translation of length 1, and the matches that agree with it ahead of both cameras."""
+
     pose: Pose
-    covariance: Array  # (6, 6), 0 along the direction
-    inliers: int
-    cost: float
+    matched: _Matched
+
+    def nearness(self) -> tuple[Array, Array]:
+        """(M,) inverse depths in the first view, in 1 / the way; how far (M,) a unit of that moves a ray."""
+        away, b, (rotation, t) = self.matched.a, self.matched.b, self.pose
+        away = _points(away, 1.0) @ rotation.T
+        u, v = away[:, :2] - b * away[:, 2:], b * t[2] - t[:2]  # u = nearness v, two equations in one unknown
+        strength = np.maximum((v**2).sum(1), 1e-12)
+        return (u * v).sum(1) / strength, np.sqrt(strength) / np.abs(away[:, 2])
 
 
-def _refined(sight: _Sight, agree: NDArray[np.bool_], pose: Pose) -> _Direction | None:
-    """With the matches that agree with a first pose, then with those that agree with the better one."""
-    for _ in range(2):
-        solved = _solved(sight[agree], pose, _moved_direction, 5) if agree.sum() >= _LEAST else None
-        if solved is None:
-            return None
-        pose, inner, scale = solved
-        fits = np.linalg.norm(sight.residuals(*pose), axis=1) < _AGREEING * scale.max()
-        used, agree = agree, fits & _in_front(sight, pose)
+def _halves(*sights: _Matched) -> Iterator[list[_Solved]]:
+    """Every sight solved from the matches of one half of the points, for many halves; those that show nothing are not
+    among them.
+
+    How solutions of halves scatter is how far that of all is off (delete-half jackknife: Shao and Wu 1989). Unlike
+    derivatives at one solution it knows of the others that fit nearly as well, as of flat and of far scenes.
+    """
+    rng, points = np.random.default_rng(0), np.unique(np.concatenate([sight.points for sight in sights]))
+    for _ in range(_HALVES):
+        half = rng.permutation(points)[: (len(points) + 1) // 2]
+        solved = [sight[np.isin(sight.points, half)].solved() for sight in sights]
+        if (found := [one for one in solved if one is not None]) and len(found) == len(sights):
+            yield found
+
+
+def _spread(poses: list[Pose]) -> tuple[Pose, Array]:
+    """The mean of poses with translations of length 1, and how far they are from it, (n, 5): two radians across the
+    direction, three of rotation.
+    """
+    u, _, vt = np.linalg.svd(np.mean([rotation for rotation, _ in poses], axis=0))
+    rotation, towards = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, np.array([t for _, t in poses])
+    direction = towards.mean(0) / max(float(np.linalg.norm(towards.mean(0))), 1e-9)
+    side = towards @ _across(direction).T
+    sine = np.maximum(np.linalg.norm(side, axis=1), 1e-9)
+    side *= (np.arctan2(sine, towards @ direction) / sine)[:, None]
+    return (rotation, direction), np.hstack([side, [logarithm(r @ rotation.T) for r, _ in poses]])
+
+
+def _covariance(away: Array, noise: float) -> Array:
+    """Of n deviations (n, d), rotation third to fifth; divided by what makes the mean of its inverse right (Wishart).
+
+    What all points of both images may be off together does not scatter, and turns the view.
+    """
+    n, d = away.shape
+    turned = np.isin(np.arange(d), (2, 3, 4)) * 2 * (_LEAST_NOISE / _NOISE * noise) ** 2
+    return away.T @ away / (n - d - 1) + np.diag(turned)
+
+
+def _doubt(covariance: Array) -> float:
+    """The largest deviation of a direction, radians."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance[:2, :2])[-1]))
+
+
+def _direction(check: EpipolarCheck, query: Intrinsics, match: Intrinsics) -> RelativePose | None:
+    """Rotation and direction of motion: the mean of what halves of the matches say, and how they scatter."""
+    matched = _Matched.of(check, query, match)
+    found = [solved for (solved,) in _halves(matched)]
+    if len(found) < _HALVES - _MOST_FAILED:
+        return None
+    pose, away = _spread([solved.pose for solved in found])
+    inner, inliers = _covariance(away, matched.noise), 2 * int(np.median([len(solved.matched.a) for solved in found]))
+    if _doubt(inner) > _LARGEST_DOUBT:
+        covariance = np.eye(6)
+        covariance[3:, 3:] = inner[2:, 2:]
+        return RelativePose(pose[0], np.zeros(3), False, inliers, covariance)
     jacobian = np.zeros((6, 5))
     jacobian[:3, :2], jacobian[3:, 2:] = _across(pose[1]).T, np.eye(3)
-    return _Direction(pose, jacobian @ inner @ jacobian.T, int(used.sum()), _cost(sight, pose))
+    return RelativePose(*pose, False, inliers, jacobian @ inner @ jacobian.T)
 
 
-def _essential(sight: _Sight, tolerance: float) -> tuple[NDArray[np.bool_], Pose] | None:
-    """The matches that agree within `tolerance` noises on an essential matrix, and its pose with them in front."""
-    a, b = (np.ascontiguousarray(rays * _FOCAL) for rays in (sight.a, sight.b))
-    camera, pixels = np.diag([_FOCAL, _FOCAL, 1.0]), tolerance * (sight.noise_a + sight.noise_b) / 2 * _FOCAL
-    essential, mask = cv2.findEssentialMat(a, b, camera, cv2.USAC_MAGSAC, 0.999, pixels)
-    if essential is None or essential.shape != (3, 3) or (mask.ravel() > 0).sum() < _LEAST:
-        return None
-    agree = mask.ravel() > 0
-    _, rotation, translation, front = cv2.recoverPose(essential, a[agree], b[agree], camera)
-    agree[agree] = front.ravel() > 0
-    return (agree, (rotation, translation.ravel())) if agree.sum() >= _LEAST else None
+def _ratio(pair: _Solved, short: _Solved) -> float:
+    """How many times as long the way of `pair` is as that of `short`, by the points of both; 0 where it is not told.
 
-
-def _cost(sight: _Sight, pose: Pose) -> float:
-    return float(np.minimum((np.linalg.norm(sight.residuals(*pose), axis=1) / _TOLERANCES[0]) ** 2, 4.0).sum())
-
-
-def _in_front(sight: _Sight, pose: Pose) -> NDArray[np.bool_]:
-    """Which rays meet ahead of both cameras, within what the noise allows."""
-    away, b = _points(sight.a, 1.0) @ pose[0].T, _points(sight.b, 1.0)
-    normal = np.cross(away, b)
-    ahead = (np.cross(pose[1], b) * -normal).sum(1), (np.cross(pose[1], away) * -normal).sum(1)
-    slack = 3 * sight.noise_b * np.linalg.norm(away, axis=1) * np.linalg.norm(b, axis=1)
-    return np.minimum(*ahead) > -slack
-
-
-def _moved_direction(pose: Pose, step: Array) -> Pose:
-    """A step (5,): two radians across the direction, three of rotation."""
-    translation = pose[1] + step[:2] @ _across(pose[1])
-    return exponential(step[2:]) @ pose[0], translation / np.linalg.norm(translation)
+    The points lie about a line through the origin, by their parallax in one and in the other; both are measured, so the
+    line is the median of their angles, by length.
+    """
+    _, one, two = np.intersect1d(pair.matched.points, short.matched.points, return_indices=True)
+    if len(one) < _LEAST_SHARED:
+        return 0.0
+    (y, gain_y), (x, gain_x) = (solved.nearness() for solved in (pair, short))
+    scale_y, scale_x = np.median(gain_y[one]), np.median(gain_x[two])
+    moved = np.column_stack([np.maximum(x[two], 0) * scale_x, np.maximum(y[one], 0) * scale_y])
+    angle, length = np.arctan2(moved[:, 1], moved[:, 0]), np.linalg.norm(moved, axis=1)
+    order = np.argsort(angle)
+    total = np.cumsum(length[order])
+    middle = angle[order][np.searchsorted(total, total[-1] / 2)]
+    return float(np.tan(middle) * scale_x / scale_y) if 0 < middle < 1.57 else 0.0
 
 
 def _moved(pose: Pose, step: Array) -> Pose:
@@ -357,41 +430,9 @@ def _across(direction: Array) -> Array:
     return np.linalg.svd(direction[None])[2][1:]
 
 
-def _only_turned(sight: _Sight) -> tuple[Array, NDArray[np.bool_]]:
-    """The rotation that most matches agree with if nothing moved, and which do."""
-    agree = np.ones(len(sight), bool)
-    for _ in range(10):
-        rotation = _rotation_between(sight.a[agree], sight.b[agree])
-        size = np.linalg.norm(_seen(_points(sight.a, 1.0) @ rotation.T) - sight.b, axis=1) / sight.noise_b
-        agree = size <= max(_LEAST_PARALLAX, float(np.median(size)))
-    return rotation, size < _LEAST_PARALLAX
-
-
-def _turn(sight: _Sight, rotation: Array) -> RelativePose:
-    """A rotation alone: what the motion adds to the residuals makes it less certain."""
-    residual = _seen(_points(sight.a, 1.0) @ rotation.T) - sight.b
-    variance = max((residual**2).sum() / (2 * len(sight) - 3), (_LEAST_NOISE / _NOISE * sight.noise_b) ** 2)
-    d = _points(sight.a, 1.0)
-    d /= np.linalg.norm(d, axis=1)[:, None]
-    information = len(d) * np.eye(3) - d.T @ d
-    covariance = np.eye(6)
-    covariance[3:, 3:] = np.linalg.inv(information) * variance
-    return RelativePose(rotation, np.zeros(3), False, len(sight), covariance)
-
-
-def _rotation_between(a: Array, b: Array) -> Array:
-    """The rotation that best takes the directions of rays a to those of b (Kabsch)."""
-    da, db = _points(a, 1.0), _points(b, 1.0)
-    da, db = da / np.linalg.norm(da, axis=1)[:, None], db / np.linalg.norm(db, axis=1)[:, None]
-    u, _, vt = np.linalg.svd(db.T @ da)
-    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-
-
-def _solved(
-    sight: _Sight, pose: Pose, moved: Callable[[Pose, Array], Pose], freedom: int
-) -> tuple[Pose, Array, Array] | None:
-    """Gauss-Newton on the Cauchy loss: the pose, the covariance (freedom, freedom) of a step that `moved` takes, and
-    the noise (M,) of each match.
+def _solved(sight: _Sight, pose: Pose) -> tuple[Pose, Array, Array] | None:
+    """Gauss-Newton on the Cauchy loss: the pose, the covariance (6, 6) of a step that `_moved` takes, and the noise
+    (M,) of each match.
 
     Each kind of match has its own noise, estimated from its residuals. None where the points do not determine it.
     """
@@ -400,24 +441,24 @@ def _solved(
         residual = sight.residuals(*pose)
         scale = _scales(residual, kind)
         weight = 1 / (1 + (np.linalg.norm(residual, axis=1) / scale / _CAUCHY) ** 2)
-        jacobian = _jacobian(sight, pose, moved, freedom) / scale[:, None, None]
+        jacobian = _jacobian(sight, pose) / scale[:, None, None]
         normal = np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
         if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e12:
             return None
         step = -np.linalg.solve(normal, np.einsum("m,mij,mi->j", weight, jacobian, residual / scale[:, None]))
         if np.abs(step).max() < _STILL:
             break
-        pose = moved(pose, step)
+        pose = _moved(pose, step)
     covariance = np.linalg.inv(normal)
     shared = np.einsum("m,mij,mik->jk", weight, jacobian, sight.of_shared(pose) / scale[:, None, None])
     carried = covariance @ shared
     return pose, covariance + carried @ carried.T, scale
 
 
-def _jacobian(sight: _Sight, pose: Pose, moved: Callable[[Pose, Array], Pose], freedom: int) -> Array:
-    """(M, 2, freedom), by central differences."""
+def _jacobian(sight: _Sight, pose: Pose) -> Array:
+    """(M, 2, 6), by central differences."""
     h = 1e-6
-    sides = [[sight.residuals(*moved(pose, sign * h * step)) for sign in (1, -1)] for step in np.eye(freedom)]
+    sides = [[sight.residuals(*_moved(pose, sign * h * step)) for sign in (1, -1)] for step in np.eye(6)]
     return np.stack([(up - down) / (2 * h) for up, down in sides], axis=-1)
 
 

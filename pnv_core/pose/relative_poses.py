@@ -12,7 +12,7 @@ from pnv_core.pose.geometry import (
     Intrinsics,
     RelativePose,
     depth_at,
-    depth_by_way,
+    pose_by_way,
     relative_pose,
     triangulated,
 )
@@ -94,15 +94,35 @@ class RelativePoses:
         found = relative_pose(check, *cameras, here, there)
         if found is None or found.metric:
             return found
-        for beside in self._beside_query(closure.query, query):
-            depth, error = self._depth_by(query, beside, check.query)
-            if depth is not None and (metric := relative_pose(check, *cameras, depth, None, error)) and metric.metric:
-                return metric
-        for beside in self._beside(closure.match, match):
-            depth, error = self._depth_by(match, beside, check.reference)
-            if depth is not None and (metric := relative_pose(check, *cameras, None, depth, error)) and metric.metric:
-                return metric
+        for view, others in (
+            (query, self._beside_query(closure.query, query)),
+            (match, self._beside(closure.match, match)),
+        ):
+            for other in others:
+                if found.translation.any() or _stereo(view, other):
+                    metric = self._scaled(check, query, match, view, other)
+                    if metric is not None:
+                        return metric
         return found
+
+    def _scaled(
+        self, check: EpipolarCheck, query: _View, match: _View, view: _View, other: _View
+    ) -> RelativePose | None:
+        """The pose with the scale by another view beside one of the two; None where that tells none."""
+        assert query.known.camera is not None
+        assert match.known.camera is not None
+        assert other.known.camera is not None
+        beside, cameras = self._check(view, other), (query.known.camera, match.known.camera)
+        if _stereo(view, other):
+            depth = self._stereo_depth(view, other, beside, check.query if view is query else check.reference)
+            here, there = (depth, None) if view is query else (None, depth)
+            metric = relative_pose(check, *cameras, here, there, _STEREO_ERROR)
+            return metric if metric is not None and metric.metric else None
+        way = _way(view, other)
+        if view is query:
+            return pose_by_way(check, beside, *cameras, other.known.camera, way, _WAY_ERROR)
+        back = pose_by_way(check.swapped(), beside, *cameras[::-1], other.known.camera, way, _WAY_ERROR)
+        return None if back is None else back.inverse()
 
     def fix(self, closure: LoopClosure, pose: RelativePose) -> Fix | None:
         """The robot in the map by a metric pose; None where the keyframe has no pose in the map's frame.
@@ -183,20 +203,15 @@ class RelativePoses:
         near += [r for r in database.refs() if r.camera != ref.camera and abs(r.stamp_ns - ref.stamp_ns) < _TOGETHER_NS]
         return _useful(view, [other for r in near if (other := self._view(r)) is not None])
 
-    def _depth_by(self, view: _View, beside: _View, points: NDArray) -> tuple[Array | None, float]:
-        """(M,) depths of a view's points by another view of known motion or way, and their relative error."""
+    def _stereo_depth(self, view: _View, other: _View, check: EpipolarCheck, points: NDArray) -> Array:
+        """(M,) depths of a view's points by the other image of a stereo pair."""
         assert view.known.camera is not None
-        assert beside.known.camera is not None
-        check = self._check(view, beside)
-        if _stereo(view, beside):
-            motion = rigid(np.eye(3), [view.known.baseline_m - beside.known.baseline_m, 0.0, 0.0])
-            depth, error = triangulated(check, view.known.camera, beside.known.camera, motion), _STEREO_ERROR
-        else:
-            depth = depth_by_way(check, view.known.camera, beside.known.camera, _way(view, beside))
-            error = _WAY_ERROR
+        assert other.known.camera is not None
+        motion = rigid(np.eye(3), [view.known.baseline_m - other.known.baseline_m, 0.0, 0.0])
+        depth = triangulated(check, view.known.camera, other.known.camera, motion)
         known = np.isfinite(depth)
         at = KeyframeGeometry(points=check.query[known], depth=depth[known].astype(np.float32))
-        return at.depth_near(points), error
+        return at.depth_near(points)
 
 
 def _stereo(one: _View, other: _View) -> bool:

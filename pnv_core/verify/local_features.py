@@ -109,7 +109,7 @@ def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float
     inlier = np.zeros(len(q), bool)
     inlier[distinct] = _epipolar_inliers(a[distinct] * WIDTH, b[distinct] * WIDTH)
     spread = min(hull_area(a[inlier]), hull_area(b[inlier])) / aspect
-    return EpipolarCheck(a, b, inlier, spread, _likeness(query, reference, q, r))
+    return EpipolarCheck(a, b, inlier, spread, _likeness(query, reference, q, r), distinct)
 
 
 def _likeness(query: LocalFeatures, reference: LocalFeatures, q: NDArray[np.int64], r: NDArray[np.int64]) -> float:

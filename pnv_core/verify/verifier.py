@@ -2,7 +2,7 @@
 `VERIFIERS`, or `VERIFIERS.register` in a program."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import cv2
@@ -20,7 +20,8 @@ class EpipolarCheck:
 
     `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both. `likeness` is the log
     of how far apart the most similar features of one image are over how far apart matched features are: high where
-    matches are sure, low where the images repeat themselves.
+    matches are sure, low where the images repeat themselves. `distinct` (M,) are the matches that look like each other
+    alone; None where all do.
     """
 
     query: NDArray[np.float32]
@@ -28,10 +29,15 @@ class EpipolarCheck:
     inlier: NDArray[np.bool_]
     spread: float
     likeness: float = 0.0
+    distinct: NDArray[np.bool_] | None = None
 
     @property
     def inliers(self) -> int:
         return int(self.inlier.sum())
+
+    def swapped(self) -> "EpipolarCheck":
+        """The same with query and reference exchanged."""
+        return replace(self, query=self.reference, reference=self.query)
 
 
 class Verifier(Protocol):
