@@ -2,10 +2,11 @@
 
     python -m benchmarks.verifiers --shared ../shared [--queries 30] [--methods rootsift-320-500,xfeat-640-500-ratio]
 
-A method is FEATURES-WIDTH-MOST[-MATCHER]: rootsift (Lowe's ratio .8), xfeat with mutual (mutual nearest neighbours),
-cosine (of at least .82, as its authors), ratio (.9 in both images) or lighterglue, aliked (with LightGlue). Every
-query's five candidates are the most similar by the default model's global vector; inliers of one epipolar geometry are
-the score.
+A method is FEATURES-WIDTH-MOST[-MATCHER[-GEOMETRY]]: rootsift (Lowe's ratio .8), xfeat with mutual (mutual nearest
+neighbours), cosine (at least .82, as its authors), ratio (.9 in both images) or lighterglue, aliked (with LightGlue).
+Every query's five candidates are the most similar by the default model's global vector; inliers of one geometry are the
+score: of a fundamental matrix, or magsac (the same by MAGSAC), homography, essential (a lens of 60 degrees is assumed),
+both (a homography or a fundamental matrix, whichever more points agree on).
 
 recall@100%: queries of all sets together whose true candidate has more inliers than any false candidate of any set.
 first: the true image first on viewpoint_places, by similarity alone and with log(1 + inliers) / 5 added. LightGlue and
@@ -93,9 +94,9 @@ class Method:
     """One way to find and match features. `describe` a grey picture, `match` two of what it gave."""
 
     def __init__(self, name: str) -> None:
-        features, width, most, *matcher = name.split("-")
+        features, width, most, *rest = name.split("-")
         self.name, self.width, self.most = name, int(width), int(most)
-        self.matcher = matcher[0] if matcher else features
+        self.matcher, self.geometry = (*rest, *(features, "fundamental")[len(rest) :])
         self._network: Any = None
         self._glue: Callable[[Any, Any], Pairs] | None = None
         if features == "xfeat":
@@ -147,13 +148,22 @@ def _rootsift(grey: Grey, width: int, most: int) -> LocalFeatures:
     return LocalFeatures(np.array([k.pt for k in keypoints], np.float32) / width, root.astype(np.float32))
 
 
-def inliers(query: LocalFeatures, reference: LocalFeatures, pairs: Pairs, width: int) -> int:
-    """Of one fundamental matrix, within 1.5 pixels."""
-    a, b = query.points[pairs[0]] * width, reference.points[pairs[1]] * width
-    mask = None
+def inliers(a: NDArray[np.float32], b: NDArray[np.float32], geometry: str) -> int:
+    """Of one geometry of matched points (M, 2), pixels: within 1.5, of a homography within 3."""
+    if geometry == "both":
+        return max(inliers(a, b, one) for one in ("homography", "fundamental"))
+    mask: Any = None
     if len(a) >= 8:
         with contextlib.suppress(cv2.error):
-            _, mask = cv2.findFundamentalMat(a, b, cv2.USAC_ACCURATE, 1.5, 0.999, 1000)
+            if geometry == "homography":
+                _, mask = cv2.findHomography(a, b, cv2.USAC_ACCURATE, 3.0, maxIters=1000, confidence=0.999)
+            elif geometry == "essential":
+                centre = np.concatenate([a, b]).max(0) / 2
+                camera = np.array([[1.75 * centre[0], 0, centre[0]], [0, 1.75 * centre[0], centre[1]], [0, 0, 1]])
+                _, mask = cv2.findEssentialMat(a, b, camera, cv2.USAC_ACCURATE, 0.999, 1.5, 1000)
+            else:
+                way = cv2.USAC_MAGSAC if geometry == "magsac" else cv2.USAC_ACCURATE
+                _, mask = cv2.findFundamentalMat(a, b, way, 1.5, 0.999, 1000)
     return 0 if mask is None else int((mask > 0).sum())
 
 
@@ -178,7 +188,9 @@ def row(method: Method, queries: dict[str, list[Query]]) -> str:
             for number, _, _ in query.candidates:
                 start = time.perf_counter()
                 pairs = method.match(known[query.number], known[number])
-                counts.append(inliers(known[query.number][0], known[number][0], pairs, method.width))
+                sides = zip((known[query.number][0], known[number][0]), pairs, strict=True)
+                a, b = (features.points[chosen] * method.width for features, chosen in sides)
+                counts.append(inliers(a, b, method.geometry))
                 match_ms.append(1e3 * (time.perf_counter() - start))
             labels = [label for _, _, label in query.candidates]
             labelled = list(zip(counts, labels, strict=True))

@@ -191,10 +191,12 @@ def plot(results: Sequence[Result], path: Path) -> None:
         axes.plot(*result.walk.truth[:, :2, 3].T, color="0.55", linewidth=3, alpha=0.6, label="truth")
         for label, poses, colour in drawn:
             axes.plot(*poses[:, :2, 3].T, color=colour, linewidth=1.2, label=label)
+        label = f"{len(result.recording.closures)} closures"
         for closure in result.recording.closures:
             ends = [stamps.get(ref.stamp_ns) for ref in (closure.query, closure.match)]
             if None not in ends:
-                axes.plot(*drawn[1][1][ends, :2, 3].T, color="#009e73", linewidth=0.6, alpha=0.6)
+                axes.plot(*drawn[1][1][ends, :2, 3].T, color="#009e73", linewidth=0.6, alpha=0.6, label=label)
+                label = "_nolegend_"
         axes.set_title(f"{result.walk.name}: {result.before_m:.2f} m to {result.after_m:.2f} m", fontsize=11)
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         axes.legend(fontsize=8)
