@@ -21,13 +21,13 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
     evidence = closure.evidence or Evidence(closure.similarity, closure.spatial, closure.inliers)
     if evidence.texture < config.min_texture:
         return replace(closure, reason=Reason.LOW_TEXTURE)
+    if closure.score < config.accept_score:  # frames that agree lift no weak one: look-alike corridors agree in order
+        return replace(closure, reason=Reason.LOW_SCORE)
     wanted = config.consistency
     path = sequence.path(closure, window_of(wanted))
     alone = wanted <= 1  # nothing beyond the closure itself is asked for
     agreed = alone or confirmed(path, wanted)
     belief = closure.score if alone or not agreed else max(closure.score, path.belief)
-    if closure.score < config.accept_score:  # frames that agree lift no weak one: look-alike corridors agree in order
-        return replace(closure, reason=Reason.LOW_SCORE)
     if config.verify and evidence.local_inliers < 0 and evidence.local_inliers != NO_PICTURE:
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
