@@ -2,8 +2,8 @@
 
 import errno
 import os
+import secrets
 import stat
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BufferedReader
@@ -15,19 +15,18 @@ from typing import BinaryIO
 def atomic_write(path: Path | str) -> Iterator[BinaryIO]:
     """Write beside `path`, flush to the disk, then rename over it. On an exception `path` is as it was."""
     target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+    name = target.parent / f".{target.name}.{secrets.token_hex(4)}.part"
+    # not mkstemp: its files are private, and to read the umask is to change it for a moment, for all threads
+    handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(name, 0o666 & ~umask)  # mkstemp makes private files
         os.replace(name, target)
         sync_folder(target.parent)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        name.unlink(missing_ok=True)
         raise
 
 

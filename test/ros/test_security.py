@@ -32,12 +32,14 @@ def test_the_node_opens_no_port_but_those_of_dds(domain, listener):
 
 
 @pytest.mark.parametrize("umask", [0o022, 0o077])
-def test_what_is_written_has_the_rights_of_the_umask(tmp_path, umask):
+def test_what_is_written_has_the_rights_of_the_umask(tmp_path, umask, monkeypatch):
     before = os.umask(umask)
     try:
-        saved(tmp_path / "map", 20)
-        with atomic_write(tmp_path / "file") as file:
-            file.write(b"x")
+        with monkeypatch.context() as patch:
+            patch.delattr(os, "umask")  # to change it, if only to read it, would change it for other threads
+            saved(tmp_path / "map", 20)
+            with atomic_write(tmp_path / "file") as file:
+                file.write(b"x")
     finally:
         os.umask(before)
     written = [tmp_path / "map", tmp_path / "file", *(tmp_path / "map").iterdir()]
