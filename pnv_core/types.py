@@ -165,7 +165,7 @@ class Evidence:
     local_matches: int = 0  # mutual nearest neighbours among the local features, whether they agree or not
     likeness: float = 0.0  # of those: log of the distance between features of one image over that of matched ones
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
-    background: float = 0.0  # similarity of the fifth most similar keyframe elsewhere, whatever is known of it
+    background: float = 0.0  # similarity of the fifth most similar keyframe elsewhere; of a young map, the middle one
 
 
 @dataclass(frozen=True)

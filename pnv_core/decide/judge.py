@@ -101,9 +101,9 @@ class Judge:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
 
     def _background(self, match: ImageRef, around: Sequence[Candidate]) -> float:
-        """How similar other places of the map are to the query: the fifth one elsewhere, the last of fewer."""
+        """How similar other places are to the query: the fifth keyframe elsewhere, the middle one of a young map."""
         elsewhere = [similarity for ref, similarity in around if self._apart(ref, match)]
-        return (elsewhere[:_BACKGROUND] or [around[-1][1]])[-1]
+        return elsewhere[_BACKGROUND - 1] if len(elsewhere) >= _BACKGROUND else around[len(around) // 2][1]
 
     def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:
         """With the most support that any other place of the match's own sequence has."""
