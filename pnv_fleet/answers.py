@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pnv_core.config import Config
 from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
 from pnv_core.decide.gates import decided
-from pnv_core.decide.judge import Judge
+from pnv_core.decide.judge import AROUND, Judge
 from pnv_core.types import LoopClosure, PlaceDescriptor, Query
 from pnv_fleet.errors import FleetError
 from pnv_fleet.places import descriptor_of, row_bytes
@@ -38,13 +38,16 @@ class Answers:
         """Every candidate of the fleet that was examined, best first. Raises FleetError where the store fails."""
         descriptor = query.descriptor
         vector = np.asarray(descriptor.global_vector, np.float32)
-        hits, refused = store.search(vector, self.config.candidates, where)
-        descriptors, more = self._descriptors(store, [hit.place.key for hit in hits])
+        hits, refused = store.search(vector, max(self.config.candidates, AROUND), where)
+        around = [(hit.place.ref, hit.similarity) for hit in hits]
+        descriptors, more = self._descriptors(store, [hit.place.key for hit in hits[: self.config.candidates]])
         self.refused += refused + more
         known = [hit for hit in hits if hit.place.key in descriptors]
         candidates = [(hit.place.ref, hit.similarity) for hit in known]
         references = [descriptors[hit.place.key] for hit in known]
-        closures = self._judge.judge(query.ref, descriptor, query.predecessor, candidates, references, self.config)
+        closures = self._judge.judge(
+            query.ref, descriptor, query.predecessor, candidates, references, self.config, around
+        )
         self._sequence.remember(query.ref.camera, closures, window_of(self.config.consistency + DOUBT))
         return [decided(closure, self.config, self._sequence) for closure in closures]
 
