@@ -29,7 +29,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         )
         if name == "push":
             action.add_argument("map", type=Path)
-            action.add_argument("--pictures", action="store_true", help="small pictures in place of their features")
+            action.add_argument("--pictures", action="store_true", help="small pictures too, not their features alone")
         if name == "query":
             action.add_argument("image", type=Path)
         if name == "pull":

@@ -98,7 +98,7 @@ class NodeConfig:
         low=0.0,
         high=1.0,
     )
-    fleet_pictures: bool = setting(False, "send the small grey pictures; false sends their local features instead")
+    fleet_pictures: bool = setting(False, "send the small grey pictures too; false sends local features alone")
     fleet_keep_days: float = setting(
         0.0,
         "this robot's places are forgotten, once an hour, when its newest image is so much newer; 0 = never",
