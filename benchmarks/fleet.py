@@ -123,6 +123,7 @@ def revisits(vectors: Array, count: int, seed: int = 1) -> Array:
 def scale(sizes: list[int], queries: int) -> None:
     import faiss
 
+    from pnv_core.decide.judge import AROUND
     from pnv_fleet.places import Place
     from pnv_fleet.store import Access, PlaceStore
 
@@ -163,9 +164,9 @@ def scale(sizes: list[int], queries: int) -> None:
             truth, busy = exact.search(asked, 10)[1], server.cpu_s()
             for vector, best in zip(asked, truth, strict=True):
                 begin = time.perf_counter()
-                hits, _ = store.search(vector, 10, where)
+                hits, _ = store.search(vector, AROUND, where)  # as many as a node asks for
                 times.append(time.perf_counter() - begin)
-                right += len({hit.place.key for hit in hits} & {keys[i] for i in best})
+                right += len({hit.place.key for hit in hits[:10]} & {keys[i] for i in best})
             ms, busy = 1e3 * np.array(times), 1e3 * (server.cpu_s() - busy) / queries
             disk = sum(f.stat().st_size for f in server.folder.rglob("*") if f.is_file())
             print(
