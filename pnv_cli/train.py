@@ -12,7 +12,7 @@ from pnv_cli.progress import bar
 from pnv_core.errors import ConfigError
 
 _VARIANT = 0  # of EfficientNet-Lite
-_POOLED_SHARE = 0.55  # of the cosine; chosen on the development sets, see MODEL_CARD.md
+_POOLED_SHARE, _MIDDLE_SHARE = 0.45, 0.275  # of the cosine; chosen on the development sets, see MODEL_CARD.md
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
@@ -42,15 +42,23 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser.add_argument("--clusters", type=int, default=16, help="K (default 16)")
     parser.add_argument("--neck", type=int, default=128, help="channels after the lite trunk (default 128)")
     parser.add_argument("--global-dim", type=int, default=512)
-    parser.add_argument("--pooled-dim", type=int, default=320, help="of --global-dim, for the pooled features")
+    parser.add_argument("--pooled-dim", type=int, default=160, help="of --global-dim, for the pooled last maps")
+    parser.add_argument(
+        "--middle-dim", type=int, default=160, help="of --global-dim, for the pooled maps before the neck; 0 = none"
+    )
     parser.add_argument("--patch-dim", type=int, default=128)
     parser.add_argument(
         "--pooled-share", type=float, default=_POOLED_SHARE,
-        help=f"of the cosine, for the pooled features (default {_POOLED_SHARE:g}); 1: GeM alone",
+        help=f"of the cosine, for the pooled last maps (default {_POOLED_SHARE:g}); 1: GeM alone",
+    )  # fmt: skip
+    parser.add_argument(
+        "--middle-share", type=float, default=_MIDDLE_SHARE,
+        help=f"of the cosine, for the pooled maps before the neck (default {_MIDDLE_SHARE:g})",
     )  # fmt: skip
     parser.add_argument(
         "--loss", choices=("ms", "ap"), default="ms",
-        help="of a training with steps: multi-similarity, or listwise average precision (--pooled-share 1: AP-GeM)",
+        help="of a training with steps: multi-similarity, or listwise average precision "
+        "(--pooled-share 1 --middle-dim 0: AP-GeM)",
     )  # fmt: skip
     parser.add_argument("--size", default="384x288", help="input size of the lite model (default 384x288)")
     parser.add_argument("--view", default="384x288", help="size of the views it is trained on (default 384x288)")
@@ -93,10 +101,13 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
     from pnv_lab.training.pool import FeaturePool
     from pnv_lab.training.trainer import Trainer, TrainOptions
 
-    if not 1 <= args.pooled_dim < args.global_dim:
-        raise ConfigError(f"--pooled-dim {args.pooled_dim}; allowed: 1 to {args.global_dim - 1}, below --global-dim")
-    if not 0 <= args.pooled_share <= 1:
-        raise ConfigError(f"--pooled-share {args.pooled_share:g} is out of range; allowed: 0 to 1")
+    if args.middle_dim < 0 or not 1 <= args.pooled_dim < args.global_dim - args.middle_dim:
+        raise ConfigError(
+            f"--pooled-dim {args.pooled_dim}, --middle-dim {args.middle_dim}; allowed: together below --global-dim"
+        )
+    middle = args.middle_share if args.middle_dim else 0.0
+    if not 0 <= middle <= 1 - args.pooled_share <= 1:
+        raise ConfigError(f"--pooled-share {args.pooled_share:g}, --middle-share {middle:g}; allowed: 0 to 1 together")
     given = {"seed": args.seed} if args.seed is not None else {}
     options = _options(TrainOptions, args.set, **({"steps": 0, "loss": args.loss} | given))
     size, view = _size(args.size), _size(args.view)
@@ -118,12 +129,14 @@ def _train_lite(args: argparse.Namespace, folder: Path, output: Path) -> None:
         patch_sizes=(2,),  # as good as any set of sizes 1 to 3 on the development sets, for the least memory
         patch_weights=(1.0,),
         pooled_share=args.pooled_share,
+        middle_share=middle,
         provenance=f"pnv train, seed {options.seed}, {options.steps} steps on {len(trained)} images; see MODEL_CARD.md",
     )
     fit = FitOptions(
         clusters=args.clusters,
         global_dim=args.global_dim,
         pooled_dim=args.pooled_dim,
+        middle_dim=args.middle_dim,
         patch_dim=args.patch_dim,
         patch_sizes=(2,),
         seed=options.seed,

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pnv_core.describe.describer import resized
 from pnv_core.describe.model_files import ModelInfo
-from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule, gem
+from pnv_core.describe.netvlad import NetVLAD, Projection, alpha_rule
 from pnv_core.describe.patches import patch_vlads
 from pnv_core.describe.torch_model import TorchModel, TorchTrunk
 from pnv_core.errors import ModelError
@@ -37,7 +37,8 @@ class FitOptions:
 
     clusters: int = 16
     global_dim: int = 512
-    pooled_dim: int = 0  # of them, how many are of the pooled features; 0 = a global vector of the VLAD alone
+    pooled_dim: int = 0  # of them, how many are of the pooled deep features; 0 = none
+    middle_dim: int = 0  # of them, how many are of the pooled features before the neck; 0 = none
     patch_dim: int = 128
     image_width: int = 320
     image_height: int = 240
@@ -164,11 +165,11 @@ def plain_progress(items: Iterable[Path], what: str) -> Iterable[Path]:
 
 
 @torch.no_grad()
-def maps_of(trunk: TorchTrunk, path: Path, options: FitOptions) -> tuple[Tensor, Tensor]:
-    """The trunk's maps (1, C, h, w) and (1, W, h, w) of an image file, on the device of the trunk."""
+def maps_of(trunk: TorchTrunk, path: Path, options: FitOptions) -> list[Tensor]:
+    """What the trunk's `maps` gives for an image file, on the device of the trunk."""
     device = next((t.device for t in (*trunk.parameters(), *trunk.buffers())), torch.device("cpu"))
-    features, wide = trunk.maps(as_batch([read_rgb(path, options.image_width, options.image_height)], device))
-    return features.float(), wide.float()
+    found = trunk.maps(as_batch([read_rgb(path, options.image_width, options.image_height)], device))
+    return [maps.float() for maps in found]
 
 
 def features_of(trunk: TorchTrunk, path: Path, options: FitOptions) -> Tensor:
@@ -219,18 +220,9 @@ def projections_of(netvlad: NetVLAD, maps: Iterable[Tensor], options: FitOptions
             parts.append(vlads[torch.randperm(len(vlads), generator=generator)[:count]])
     most = len(whole) // SAMPLES_PER_DIMENSION if options.whiten else len(whole) - 1
     return (
-        projection_of(
-            *pca(torch.stack(whole), max(1, min(options.global_dim - options.pooled_dim, most)), options.whiten)
-        ),
+        projection_of(*pca(torch.stack(whole), max(1, min(options.global_dim, most)), options.whiten)),
         projection_of(*pca(torch.cat(parts), options.patch_dim, options.whiten)),
     )
-
-
-@torch.no_grad()
-def pooled_projection_of(maps: Iterable[Tensor], options: FitOptions) -> Projection:
-    """The projection of the generalised means of maps (W, h, w), by PCA."""
-    pooled = torch.cat([gem(m[None].float()) for m in maps])
-    return projection_of(*pca(pooled, options.pooled_dim, options.whiten))
 
 
 def fit_vocabulary(
@@ -310,18 +302,17 @@ def adapt_model(
     model.trunk.eval()
     rows = []
     for file in progress(files, "projection"):
-        features, wide = maps_of(model.trunk, file, options)
-        rows.append((model.netvlad(features.cpu())[0], gem(wide.cpu())[0]))
-    vlads, pooled = (torch.stack(part) for part in zip(*rows, strict=True))
+        features, wide, deep = (maps.cpu() for maps in maps_of(model.trunk, file, options))
+        rows.append({"global_projection": model.netvlad(features), **model.means(wide, deep)})
+    inputs = {part: torch.cat([row[part] for row in rows]) for part in rows[0]}
     if poses is None:
-        pairs = alike(pairs, model.joined(vlads, pooled))
+        pairs = alike(pairs, model.joined(inputs))
     if len(pairs) < _LEAST_PAIRS:
         raise ModelError(
             f"{len(pairs)} pairs of images show one place: too few to adapt to; allowed: {_LEAST_PAIRS} or more"
         )
-    whole = adapted_projection(model.global_projection, vlads, pairs)
-    beside = model.pooled_projection and adapted_projection(model.pooled_projection, pooled, pairs)
-    return replace(model, global_projection=whole, patch_projection=model.patches_projection, pooled_projection=beside)
+    adapted = {part: adapted_projection(getattr(model, part), given, pairs) for part, given in inputs.items()}
+    return replace(model, patch_projection=model.patches_projection, **adapted)
 
 
 def fit_model(

@@ -66,7 +66,7 @@ def read_model(path: Path) -> Model:
 class Describing(Protocol):
     """What computes descriptors: a model at one image size, in one library."""
 
-    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]: ...
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]: ...
 
     def describe(
         self, pixels: NDArray[np.uint8], cells: NDArray[np.float32] | None = None
@@ -151,8 +151,8 @@ class Describer:
         )
         return PlaceDescriptor(vector, patches, texture(pixels, valid))
 
-    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(H, W, 3) uint8 of the configured size -> the trunk's maps (C, h, w) and, before its neck, (W, h, w)."""
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]:
+        """(H, W, 3) uint8 of the configured size -> the trunk's maps (C, h, w), before its neck (W, h, w), deep."""
         return self._describing.maps(pixels)
 
 

@@ -5,7 +5,7 @@ K clusters, C channels, D dimensions.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +25,9 @@ from pnv_core.files import atomic_write
 FORMAT = "pnv-model-1"
 _MOST_TEXT = 100_000  # characters of a text in the metadata
 _MOST_SIZES = 16
-OPTIONAL = ("patch_projection", "pooled_projection")
+BESIDE = {"pooled_projection": "pooled_share", "middle_projection": "middle_share"}
+"""Parts of the global vector beside the VLAD, and what their share of the cosine is called."""
+OPTIONAL = ("patch_projection", *BESIDE)
 
 Tensors = Mapping[str, NDArray[np.float32]]
 
@@ -69,6 +71,7 @@ class ModelInfo:
     patch_sizes: tuple[int, ...] = (2, 5, 8)
     patch_weights: tuple[float, ...] = (0.45, 0.15, 0.4)
     pooled_share: float = 0.5  # of the cosine of two global vectors, where a part of them is pooled
+    middle_share: float = 0.0  # the same of what is pooled of the maps before the neck
     provenance: str = ""
     calibration: dict[str, Any] | None = None
 
@@ -79,8 +82,9 @@ class Model:
 
     Without the part `patch_projection` patches share the global one, as in the paper. With `pooled_projection` the
     global vector is the projected VLAD beside the projected generalised mean of the map that the trunk has for
-    it, weighed by `pooled_share`: it keeps how strongly features respond, which VLAD's unit local descriptors do not.
-    Without it (every published model) the global vector is the projected VLAD.
+    it, with `middle_projection` beside that of the map before the neck, weighed by their shares: they keep how strongly
+    features respond, which VLAD's unit local descriptors do not. Without them (every published model) the global vector
+    is the projected VLAD.
     """
 
     info: ModelInfo
@@ -106,10 +110,14 @@ class Model:
         """The part that projects patches."""
         return "patch_projection" if self.has("patch_projection") else "global_projection"
 
+    @property
+    def shares(self) -> dict[str, float]:
+        """The parts that the global vector is made of, in order, and the share of each in the cosine."""
+        return shares_of(self.info, [part for part in BESIDE if self.has(part)])
+
     @cached_property
     def global_dim(self) -> int:
-        pooled = len(self.tensors["pooled_projection.bias"]) if self.has("pooled_projection") else 0
-        return len(self.tensors["global_projection.bias"]) + pooled
+        return sum(len(self.tensors[f"{part}.bias"]) for part in self.shares)
 
     @cached_property
     def patch_dim(self) -> int:
@@ -121,9 +129,10 @@ class Model:
             self.tensors.close()
 
     def fingerprint(self) -> str:
-        """sha256 over the tensors, the trunk's name and the pooled share: equal fingerprints describe alike."""
+        """sha256 over the tensors, the trunk's name and the parts' shares: equal fingerprints describe alike."""
         share = [] if self.info.pooled_share == 0.5 else [self.info.pooled_share]
-        kind = [self.info.trunk, self.info.trunk_options, *share]
+        middle = [self.info.middle_share] if self.info.middle_share else []
+        kind = [self.info.trunk, self.info.trunk_options, *share, *middle]
         digest = hashlib.sha256(json.dumps(kind, sort_keys=True).encode())
         for name, tensor in sorted(self.tensors.items()):
             digest.update(f"{name}{tuple(tensor.shape)}".encode())
@@ -132,6 +141,12 @@ class Model:
 
     def with_info(self, **changes: Any) -> "Model":
         return replace(self, info=replace(self.info, **changes))
+
+
+def shares_of(info: ModelInfo, beside: Sequence[str]) -> dict[str, float]:
+    """The share in the cosine of the projected VLAD and of the parts `beside` it."""
+    found = {part: getattr(info, BESIDE[part]) for part in beside}
+    return {"global_projection": max(1.0 - sum(found.values()), 0.0), **found}
 
 
 def build_model(info: ModelInfo, tensors: Mapping[str, NDArray], source: str) -> Model:
@@ -162,8 +177,12 @@ def build_model(info: ModelInfo, tensors: Mapping[str, NDArray], source: str) ->
             bias = model.tensors.get(f"{part}.bias")
             if bias is None or bias.ndim != 1:
                 raise ModelError(f"{source}: {part}.bias is missing or no vector; allowed: (D,)")
-            inputs = trunk.pooled_width if part == "pooled_projection" else centroids.size
+            inputs = {"pooled_projection": trunk.pooled_width, "middle_projection": trunk.width}.get(
+                part, centroids.size
+            )
             expected[part] = {"bias": bias.shape, "weight": (len(bias), inputs)}
+    if sum(model.shares.values()) > 1.0 + 1e-6:
+        raise ModelError(f"{source}: pooled_share + middle_share = {sum(model.shares.values()):g}; allowed: up to 1")
     for part, shapes in expected.items():
         _check_exactly(shapes, model.part(part), f"{source}: {part}")
     return model
@@ -252,6 +271,7 @@ def _info(metadata: dict[str, str], source: str) -> ModelInfo:
         patch_sizes=sizes,
         patch_weights=weights,
         pooled_share=part("pooled_share", _Weight) if "pooled_share" in metadata else ModelInfo.pooled_share,
+        middle_share=part("middle_share", _Weight) if "middle_share" in metadata else ModelInfo.middle_share,
         provenance=metadata.get("provenance", ""),
         calibration=calibration,
     )

@@ -52,13 +52,12 @@ class OpenVinoDescribing:
     def _trunk(self) -> Compiled:
         return self._compiled(partial(trunk_maps, self._model, self._size), "trunk", self._size)
 
-    def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, Floats]:
-        """The trunk's maps: features (C, h, w), and what is pooled (E, h', w')."""
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, ...]:
+        """The trunk's maps: features (C, h, w), before the neck (W, h, w), and deep ones (E, h', w')."""
         if self._dense is not None:
-            features = self._dense(pixels)
-            return features, features
+            return (self._dense(pixels),) * 3
         found = self._trunk(np.ascontiguousarray(pixels)[None])
-        return found[0][0], found[-1][0]
+        return found[0][0], found[1 if self._model.trunk.neck else 0][0], found[-1][0]
 
     def describe(self, pixels: NDArray[np.uint8], cells: Floats | None = None) -> tuple[Floats, list[Floats]]:
         """The global vector (D,) and the patches [(n, D), ...]. `cells` (h, w) say how much each cell counts."""
@@ -67,48 +66,47 @@ class OpenVinoDescribing:
             vector, *patches = self._graph(np.ascontiguousarray(pixels)[None], counted)
         else:
             features = self._dense(pixels)[None]
-            vector, *patches = self._graph(features, features, counted)
+            vector, *patches = self._graph(features, counted)
         return vector, patches
 
 
 def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Model:
     """(1, H, W, 3) uint8 and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
-    pixels, features, wide = _maps(model, size)
+    pixels, *maps = _maps(model, size)
     counted = ops.parameter([1, 1, *model.trunk.shape(*size)[1:]], np.float32)
-    return ov.Model(_described(model, features, wide, counted, windows), [pixels, counted], "describing")
+    return ov.Model(_described(model, *maps, counted, windows), [pixels, counted], "describing")
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
-    """As `describing`, from the trunk's maps: (1, C, h, w), (1, E, h', w') and (1, 1, h, w)."""
+    """As `describing`, from a dense trunk's features (1, C, h, w), which are its every map, and (1, 1, h, w)."""
     features = ops.parameter([1, model.trunk.channels, *cells], np.float32)
-    wide = ops.parameter([1, *model.trunk.pooled_shape(cells)], np.float32)
     counted = ops.parameter([1, 1, *cells], np.float32)
-    return ov.Model(_described(model, features, wide, counted, windows), [features, wide, counted], "head")
+    return ov.Model(_described(model, features, features, features, counted, windows), [features, counted], "head")
 
 
 def trunk_maps(model: Model, size: tuple[int, int]) -> ov.Model:
-    """(1, H, W, 3) uint8 -> the trunk's features, and what is pooled where that is another map."""
-    pixels, features, wide = _maps(model, size)
-    different = model.trunk.neck or model.trunk.deep
-    return ov.Model([features, wide] if different else [wide], [pixels], "trunk")
+    """(1, H, W, 3) uint8 -> the trunk's features, the map before its neck and the deep one, each once."""
+    pixels, features, wide, deep = _maps(model, size)
+    outputs = [features] * bool(model.trunk.neck) + [wide] + [deep] * bool(model.trunk.deep)
+    return ov.Model(outputs, [pixels], "trunk")
 
 
-def _maps(model: Model, size: tuple[int, int]) -> tuple[Node, Node, Node]:
-    """The graph's input, the trunk's features, and what is pooled."""
+def _maps(model: Model, size: tuple[int, int]) -> tuple[Node, Node, Node, Node]:
+    """The graph's input; the trunk's features, the map before its neck and the deep one."""
     trunk, weights = model.trunk, model.part("trunk")
     pixels, images = image_input(*size)
     wide = build(trunk.layers, weights, images)
-    return pixels, build(trunk.neck, weights, wide), build(trunk.deep, weights, wide)
+    return pixels, build(trunk.neck, weights, wide), wide, build(trunk.deep, weights, wide)
 
 
-def _described(model: Model, features: Node, wide: Node, counted: Node, windows: Windows) -> list[Node]:
+def _described(model: Model, features: Node, wide: Node, deep: Node, counted: Node, windows: Windows) -> list[Node]:
     """What follows the trunk."""
     centroids = model.tensors["netvlad.centroids"]
     _, c, h, w = features.output(0).shape
     x = ops.reshape(_unit(features, 1), integers(c, h * w), False)
     logits = ops.matmul(constant(model.tensors["netvlad.assignment"]), x, False, False)  # (K, N)
     weights = ops.multiply(ops.softmax(logits, 0), ops.reshape(counted, integers(1, h * w), False))
-    vector = _global_vector(model, x, weights, wide, counted)
+    vector = _global_vector(model, x, weights, {"pooled_projection": deep, "middle_projection": wide}, counted)
     scales = _scales(centroids, x, weights, (h, w), windows)
     return [vector, *_patches(model, x, weights, scales, (h, w), windows)]
 
@@ -123,26 +121,31 @@ def _projected(model: Model, part: str, row: Node) -> Node:
     return _unit(ops.add(ops.matmul(row, constant(weight), False, True), constant(bias[None])), 1)
 
 
-def _global_vector(model: Model, x: Node, weights: Node, wide: Node, counted: Node) -> Node:
-    """Projected VLAD, and beside it the projected generalised mean where the model has one: (D,)."""
+def _global_vector(model: Model, x: Node, weights: Node, maps: dict[str, Node], counted: Node) -> Node:
+    """Projected VLAD, beside it the projected generalised means of those `maps` that the model has a part for: (D,)."""
     centroids = model.tensors["netvlad.centroids"]
     mass = ops.reduce_sum(weights, integers(1), True)  # (K, 1)
     sums = ops.subtract(ops.matmul(weights, x, False, True), ops.multiply(mass, constant(centroids)))
     vlad = _unit(ops.reshape(_unit(sums, 1), integers(1, centroids.size), False), 1)
-    vector = _projected(model, "global_projection", vlad)
-    if model.has("pooled_projection"):
-        step = counted.shape[3] // wide.shape[3]
-        if step > 1:
-            counted = ops.avg_pool(counted, [step, step], [0, 0], [0, 0], [step, step], True)
-        cubes = ops.power(ops.maximum(wide, constant(1e-6)), constant(3.0))
-        total = ops.reduce_sum(ops.multiply(cubes, counted), integers(2, 3), False)  # (1, W)
-        area = ops.maximum(ops.reduce_sum(counted, integers(2, 3), False), constant(1e-6))
-        mean = ops.maximum(ops.divide(total, area), constant(1e-18))
-        pooled = _unit(ops.power(mean, constant(1 / 3)), 1)
-        share = model.info.pooled_share
-        halves = ((vector, 1 - share), (_projected(model, "pooled_projection", pooled), share))
-        vector = ops.concat([ops.multiply(half, constant(np.sqrt(part))) for half, part in halves], 1)
-    return ops.reshape(vector, integers(-1), False)
+    parts = [
+        ops.multiply(
+            _projected(model, part, _mean(maps[part], counted) if part in maps else vlad), constant(np.sqrt(share))
+        )
+        for part, share in model.shares.items()
+    ]
+    return ops.reshape(ops.concat(parts, 1), integers(-1), False)
+
+
+def _mean(maps: Node, counted: Node) -> Node:
+    """Generalised mean (p = 3) over the cells of (1, E, h', w'): unit (1, E)."""
+    step = counted.shape[3] // maps.shape[3]
+    if step > 1:
+        counted = ops.avg_pool(counted, [step, step], [0, 0], [0, 0], [step, step], True)
+    floored = ops.maximum(maps, constant(1e-6))
+    cubes = ops.multiply(ops.multiply(floored, floored), floored)
+    total = ops.reduce_sum(ops.multiply(cubes, counted), integers(2, 3), False)
+    area = ops.maximum(ops.reduce_sum(counted, integers(2, 3), False), constant(1e-6))
+    return _unit(ops.power(ops.maximum(ops.divide(total, area), constant(1e-18)), constant(1 / 3)), 1)
 
 
 def _window_means(maps: Node, size: int, stride: int) -> Node:

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from pnv_core.describe.model_files import OPTIONAL, Model, ModelInfo, build_model
+from pnv_core.describe.model_files import BESIDE, OPTIONAL, Model, ModelInfo, build_model, shares_of
 from pnv_core.describe.netvlad import NetVLAD, Projection, gem
 from pnv_core.describe.patches import patch_descriptors
 from pnv_core.describe.trunks.trunk import Trunk
@@ -33,12 +33,12 @@ class TorchTrunk(TorchNetwork):
         """Layers before the neck, after those that prepare the image."""
         return len(self.trunk.layers) - self.trunk.input_layers
 
-    def maps(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        """The feature map (B, C, h, w), and the one that is pooled (B, E, h', w')."""
+    def maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The feature map (B, C, h, w), that before the neck (B, W, h, w), and the deep one (B, E, h', w')."""
         if self.trunk.dense is not None:
             features = [self.trunk.dense(image) for image in images.permute(0, 2, 3, 1).cpu().numpy()]
             found = torch.from_numpy(np.stack(features)).to(images.device)
-            return found, found
+            return found, found, found
         return self.back(self.front(images, 0), 0)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -48,10 +48,10 @@ class TorchTrunk(TorchNetwork):
         """(B, 3, H, W) -> what the first `layers`, after those that prepare the image, give."""
         return self.run(images, 0, self.trunk.input_layers + layers)
 
-    def back(self, maps: Tensor, layers: int) -> tuple[Tensor, Tensor]:
-        """The rest after `front` with as many layers: features, and what is pooled."""
+    def back(self, maps: Tensor, layers: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The rest after `front` with as many layers: what `maps` gives."""
         wide = self.wide(maps, layers)
-        return self.run(wide, len(self.trunk.layers)), self._run(self.trunk.deep, wide)
+        return self.run(wide, len(self.trunk.layers)), wide, self._run(self.trunk.deep, wide)
 
     def wide(self, maps: Tensor, layers: int) -> Tensor:
         """As `back`, before the neck: (B, W, h, w)."""
@@ -72,6 +72,7 @@ class TorchModel:
     global_projection: Projection
     patch_projection: Projection | None = None
     pooled_projection: Projection | None = None
+    middle_projection: Projection | None = None
 
     @classmethod
     def of(cls, model: Model) -> "TorchModel":
@@ -105,24 +106,28 @@ class TorchModel:
     def patches_projection(self) -> Projection:
         return self.patch_projection or self.global_projection
 
-    def global_vector(self, vlad: Tensor, wide: Tensor, cells: Tensor | None = None) -> Tensor:
-        """VLADs (B, K * C) and the maps that are pooled (B, E, h', w') -> unit global vectors (B, D).
+    def global_vector(self, vlad: Tensor, wide: Tensor, deep: Tensor, cells: Tensor | None = None) -> Tensor:
+        """VLADs (B, K * C), maps before the neck (B, W, h, w) and deep ones (B, E, h', w') -> unit vectors (B, D).
 
         `cells` (B, 1, h, w) say how much each cell counts.
         """
-        if self.pooled_projection is None:
-            return self.joined(vlad)
-        if cells is not None:
-            cells = F.avg_pool2d(cells, cells.shape[-1] // wide.shape[-1]).flatten(1)
-        return self.joined(vlad, gem(wide, cells))
+        return self.joined({"global_projection": vlad, **self.means(wide, deep, cells)})
 
-    def joined(self, vlad: Tensor, pooled: Tensor | None = None) -> Tensor:
-        """VLADs (B, K * C) and generalised means (B, E) -> unit global vectors (B, D)."""
-        vector: Tensor = self.global_projection(vlad)
-        if self.pooled_projection is None:
-            return vector
-        share, pooled = self.info.pooled_share, self.pooled_projection(pooled)
-        return torch.cat([vector * math.sqrt(1 - share), pooled * math.sqrt(share)], dim=1)
+    def means(self, wide: Tensor, deep: Tensor, cells: Tensor | None = None) -> dict[str, Tensor]:
+        """The generalised means (B, W or E) that are projected beside the VLAD, by their parts' names."""
+        maps = {"pooled_projection": deep, "middle_projection": wide}
+        return {part: _mean(maps[part], cells) for part in BESIDE if getattr(self, part) is not None}
+
+    def joined(self, inputs: dict[str, Tensor]) -> Tensor:
+        """VLADs (B, K * C) and generalised means, by the parts that project them -> unit global vectors (B, D)."""
+        shares = shares_of(self.info, [part for part in BESIDE if part in inputs])
+        return torch.cat([getattr(self, part)(inputs[part]) * math.sqrt(s) for part, s in shares.items()], dim=1)
+
+
+def _mean(maps: Tensor, cells: Tensor | None) -> Tensor:
+    if cells is not None:
+        cells = F.avg_pool2d(cells, cells.shape[-1] // maps.shape[-1]).flatten(1)
+    return gem(maps, cells)
 
 
 class TorchDescribing:
@@ -141,30 +146,29 @@ class TorchDescribing:
         self._model.trunk.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._threads = threads
 
-    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """The trunk's maps: features (C, h, w), and what is pooled (E, h', w')."""
+    def maps(self, pixels: NDArray[np.uint8]) -> tuple[NDArray[np.float32], ...]:
+        """The trunk's maps: features (C, h, w), before the neck (W, h, w), and deep ones (E, h', w')."""
         with torch.inference_mode(), _threads(self._threads):
-            features, wide = self._maps(pixels)
-            return features[0].cpu().numpy(), wide[0].cpu().numpy()
+            return tuple(maps[0].cpu().numpy() for maps in self._maps(pixels))
 
-    def _maps(self, pixels: NDArray[np.uint8]) -> tuple[Tensor, Tensor]:
+    def _maps(self, pixels: NDArray[np.uint8]) -> tuple[Tensor, Tensor, Tensor]:
         images = torch.from_numpy(pixels.copy()).to(self._device).permute(2, 0, 1)[None].float() / 255.0
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._half):
-            features, wide = self._model.trunk.maps(images.contiguous(memory_format=torch.channels_last))
-        return features.float(), wide.float()
+            features, wide, deep = self._model.trunk.maps(images.contiguous(memory_format=torch.channels_last))
+        return features.float(), wide.float(), deep.float()
 
     def describe(
         self, pixels: NDArray[np.uint8], cells: NDArray[np.float32] | None = None
     ) -> tuple[NDArray[np.float32], list[NDArray[np.float32]]]:
         """The global vector (D,) and the patches [(n, D), ...]. `cells` (h, w) say how much each cell counts."""
         with torch.inference_mode(), _threads(self._threads):
-            features, wide = self._maps(pixels)
+            features, wide, deep = self._maps(pixels)
             x, weights = self._model.netvlad.soft_assign(features)
             counted = None
             if cells is not None:
                 counted = torch.from_numpy(cells).to(weights).reshape(1, 1, *features.shape[-2:])
                 weights = weights * counted.flatten(2)
-            vector = self._model.global_vector(self._model.netvlad.vlad(x, weights), wide, counted)[0]
+            vector = self._model.global_vector(self._model.netvlad.vlad(x, weights), wide, deep, counted)[0]
             projection, centroids = self._model.patches_projection, self._model.netvlad.centroids
             patches = patch_descriptors(
                 x[0], weights[0], centroids, projection.weight, projection.bias,

@@ -62,8 +62,8 @@ class PooledPatches(_Describing):
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         pixels = self.pixels(rgb)
         with torch.inference_mode():
-            features, wide = (torch.from_numpy(maps)[None] for maps in self.describer.maps(pixels))
-            vector = self.model.global_vector(self.model.netvlad(features), wide)[0]
+            features, wide, deep = (torch.from_numpy(maps)[None] for maps in self.describer.maps(pixels))
+            vector = self.model.global_vector(self.model.netvlad(features), wide, deep)[0]
             patches = []
             for size, stride, rows, cols in self.describer.grids():
                 pooled = self.pool(features, size, stride)[0].flatten(1).T  # (rows * cols, C)
@@ -79,8 +79,8 @@ class GeM(_Describing):
 
     def record(self, rgb: NDArray[np.uint8]) -> Record:
         with torch.inference_mode():
-            wide = torch.from_numpy(self.describer.maps(self.pixels(rgb))[1])
-            return {"global": gem(wide[None])[0].numpy()}
+            deep = torch.from_numpy(self.describer.maps(self.pixels(rgb))[-1])
+            return {"global": gem(deep[None])[0].numpy()}
 
 
 def multiscale_vlad(model: TorchModel, rgb: NDArray[np.uint8], size: tuple[int, int]) -> Tensor:

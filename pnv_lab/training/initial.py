@@ -83,24 +83,28 @@ def initial_model(
         trunk.state_dict() | {"neck.weight": weight[:, :, None, None], "neck.bias": torch.zeros(neck)}
     )
     netvlad = vocabulary(F.normalize(samples @ weight.T, dim=1), options)
-    model = TorchModel(info, whole.eval(), netvlad, Projection(1, 1), Projection(1, 1), Projection(1, 1))
+    model = TorchModel(info, whole.eval(), netvlad, Projection(1, 1))
     return whitened(model, pool, layers, options)
 
 
 @torch.no_grad()
 def whitened(model: TorchModel, pool: FeaturePool, layers: int, options: FitOptions) -> TorchModel:
-    """The model with its three projections learned from the pool's views of the same places."""
-    vlads, pooled = [], []
+    """The model with its projections learned from the pool's views of the same places."""
+    beside = {"pooled_projection": options.pooled_dim, "middle_projection": options.middle_dim}
+    dims = {"global_projection": options.global_dim - sum(beside.values()), **{p: d for p, d in beside.items() if d}}
+    rows: dict[str, list[Tensor]] = {part: [] for part in dims}
     for start in range(0, len(pool.maps), _BATCH):
-        features, wide = model.trunk.back(torch.from_numpy(pool.maps[start : start + _BATCH]).float(), layers)
-        vlads.append(model.netvlad(features))
-        pooled.append(gem(wide))
+        features, wide, deep = model.trunk.back(torch.from_numpy(pool.maps[start : start + _BATCH]).float(), layers)
+        given = {"pooled_projection": deep, "middle_projection": wide}
+        for part, found in rows.items():
+            found.append(gem(given[part]) if part in given else model.netvlad(features))
     places = torch.arange(len(pool.maps)) // pool.batches.options.views
-    whole = learned_whitening(torch.cat(vlads), places, options.global_dim - options.pooled_dim)
-    beside = learned_whitening(torch.cat(pooled), places, options.pooled_dim)
-    parts = learned_whitening(*_corresponding_patches(model, pool, layers, options), options.patch_dim)
-    projections = (projection_of(*found) for found in (whole, parts, beside))
-    return TorchModel(model.info, model.trunk, model.netvlad, *projections)
+    fitted = {part: learned_whitening(torch.cat(rows[part]), places, dim) for part, dim in dims.items()}
+    fitted["patch_projection"] = learned_whitening(
+        *_corresponding_patches(model, pool, layers, options), options.patch_dim
+    )
+    projections = {part: projection_of(*found) for part, found in fitted.items()}
+    return TorchModel(model.info, model.trunk, model.netvlad, **projections)
 
 
 def _corresponding_patches(
@@ -128,7 +132,7 @@ def _corresponding_patches(
 
 def _patches_of(model: TorchModel, pool: FeaturePool, row: int, layers: int, size: int) -> tuple[Tensor, Tensor]:
     """The patch VLADs (n, K * C) of a view and where they lie in their scene (n, 3), in cells."""
-    features, _ = model.trunk.back(torch.from_numpy(pool.maps[row : row + 1]).float(), layers)
+    features, *_ = model.trunk.back(torch.from_numpy(pool.maps[row : row + 1]).float(), layers)
     x, weights = model.netvlad.soft_assign(features)
     shape = (features.shape[-2], features.shape[-1])
     vlads = patch_vlads(x[0], weights[0], model.netvlad.centroids, shape, size)

@@ -85,6 +85,7 @@ class Trainer:
                 "whole": model.global_projection,
                 "parts": model.patch_projection,
                 "pooled": model.pooled_projection,
+                **({} if model.middle_projection is None else {"middle": model.middle_projection}),
             }
         ).to(self.device)
         self.parts["trunk"].to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -138,6 +139,7 @@ class Trainer:
             "whole": o.projection_lr,
             "parts": o.projection_lr,
             "pooled": o.projection_lr,
+            "middle": o.projection_lr,
         }
         left = {n: p for n, p in self.parts.named_parameters() if p.requires_grad}
         groups = []
@@ -156,9 +158,9 @@ class Trainer:
 
     def _update(self, batch: Batch) -> dict[str, float]:
         self.parts.train()
-        features, wide = self._maps(batch.inputs.to(self.device))
+        features, *maps = self._maps(batch.inputs.to(self.device))
         x, weights = self.model.netvlad.soft_assign(features)
-        vectors = self.model.global_vector(self.model.netvlad.vlad(x, weights), wide)
+        vectors = self.model.global_vector(self.model.netvlad.vlad(x, weights), *maps)
         whole = LOSSES[self.options.loss](vectors, batch.positive.to(self.device), batch.negative.to(self.device))
         parts = self._patch_loss(batch, x, weights, (features.shape[-2], features.shape[-1]))
         loss = whole + self.options.patch_weight * parts
@@ -184,7 +186,7 @@ class Trainer:
             raise ModelError(f"the loss is {value} at step {self.step}; lower the learning rates")
         return {"loss": value, "global_loss": float(whole.detach()), "patch_loss": float(parts.detach())}
 
-    def _maps(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+    def _maps(self, inputs: Tensor) -> list[Tensor]:
         """The trunk's maps of images, or of what the frozen layers gave for them."""
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.options.mixed):
             if inputs.dtype == torch.uint8:
@@ -192,7 +194,7 @@ class Trainer:
             else:
                 maps = inputs.float().contiguous(memory_format=torch.channels_last)
                 found = self.model.trunk.back(maps, self.options.frozen_layers)
-        return found[0].float(), found[1].float()
+        return [maps.float() for maps in found]
 
     def _patch_loss(self, batch: Batch, x: Tensor, weights: Tensor, shape: tuple[int, int]) -> Tensor:
         """Mean over some image pairs of one scene, at one patch size."""

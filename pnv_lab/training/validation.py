@@ -74,8 +74,8 @@ def describe_all(model: TorchModel, images: NDArray[np.uint8], device: torch.dev
         pixels = torch.from_numpy(images[start : start + 32]).to(device).permute(0, 3, 1, 2)
         batch = (pixels.float() / 255).contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=mixed):
-            features, wide = model.trunk.maps(batch)
-        found.append(model.global_vector(model.netvlad(features.float()), wide.float()))
+            features, wide, deep = model.trunk.maps(batch)
+        found.append(model.global_vector(model.netvlad(features.float()), wide.float(), deep.float()))
     return torch.cat(found)
 
 

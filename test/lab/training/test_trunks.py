@@ -40,10 +40,11 @@ def test_front_and_back_make_the_whole_trunk():
     images = torch.rand(2, 3, 96, 112)
     with torch.inference_mode():
         maps = trunk.front(images, 9)
-        features, pooled = trunk.back(maps, 9)
+        features, wide, deep = trunk.back(maps, 9)
         assert torch.equal(features, trunk(images))
-        assert torch.equal(trunk.run(trunk.wide(maps, 9), len(trunk.trunk.layers)), features)
-        assert pooled.shape[1:] == trunk.trunk.pooled_shape(features.shape[2:]) == (1280, 3, 3)
+        assert torch.equal(wide, trunk.wide(maps, 9))
+        assert torch.equal(trunk.run(wide, len(trunk.trunk.layers)), features)
+        assert deep.shape[1:] == trunk.trunk.pooled_shape(features.shape[2:]) == (1280, 3, 3)
 
 
 def test_rootsift_ignores_brightness_and_contrast():
