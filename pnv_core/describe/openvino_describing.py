@@ -50,7 +50,7 @@ class OpenVinoDescribing:
 
     @cached_property
     def _trunk(self) -> Compiled:
-        return self._compiled(partial(trunk_maps, self._model, self._size), "trunk", self._size)
+        return self._compiled(partial(trunk_maps, self._model, self._size), "maps", self._size)
 
     def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, ...]:
         """The trunk's maps: features (C, h, w), before the neck (W, h, w), and deep ones (E, h', w')."""
@@ -66,7 +66,7 @@ class OpenVinoDescribing:
             vector, *patches = self._graph(np.ascontiguousarray(pixels)[None], counted)
         else:
             features = self._dense(pixels)[None]
-            vector, *patches = self._graph(features, counted)
+            vector, *patches = self._graph(features, features, counted)
         return vector, patches
 
 
@@ -78,10 +78,13 @@ def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Mode
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
-    """As `describing`, from a dense trunk's features (1, C, h, w), which are its every map, and (1, 1, h, w)."""
+    """As `describing`, from the trunk's maps: (1, C, h, w), (1, E, h', w') and (1, 1, h, w); for a model without
+    `middle_projection`, as a dense trunk makes it.
+    """
     features = ops.parameter([1, model.trunk.channels, *cells], np.float32)
+    deep = ops.parameter([1, *model.trunk.pooled_shape(cells)], np.float32)
     counted = ops.parameter([1, 1, *cells], np.float32)
-    return ov.Model(_described(model, features, features, features, counted, windows), [features, counted], "head")
+    return ov.Model(_described(model, features, features, deep, counted, windows), [features, deep, counted], "head")
 
 
 def trunk_maps(model: Model, size: tuple[int, int]) -> ov.Model:
