@@ -24,9 +24,9 @@ class Workers:
     def map(self, function: Callable[[Any], T], parts: Iterable[Any]) -> list[T]:
         """The results in the order of the parts; the first exception is raised."""
         parts = list(parts)
-        if self._pool is None or len(parts) < 2:
-            return [function(part) for part in parts]
         with alone():
+            if self._pool is None or len(parts) < 2:
+                return [function(part) for part in parts]
             return list(self._pool.map(function, parts))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 
@@ -102,7 +103,7 @@ class Judge:
 
     def _background(self, match: ImageRef, around: Sequence[Candidate]) -> float:
         """How similar other places are to the query: the fifth keyframe elsewhere, the middle one of a young map."""
-        elsewhere = [similarity for ref, similarity in around if self._apart(ref, match)]
+        elsewhere = list(islice((s for ref, s in around if self._apart(ref, match)), _BACKGROUND))
         return elsewhere[_BACKGROUND - 1] if len(elsewhere) >= _BACKGROUND else around[len(around) // 2][1]
 
     def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:

@@ -315,6 +315,7 @@ def test_describing_and_working_leave_the_threads_of_the_program_around_them_as_
         assert counts() == found
         pool = workers(3)
         assert pool.map(lambda _: cv2.getNumThreads(), range(6)) == [1] * 6
+        assert workers(1).map(lambda _: cv2.getNumThreads(), range(2)) == [1, 1]
         with pytest.raises(ZeroDivisionError):
             pool.map(lambda part: 1 // part, [1, 0])
         assert counts() == found
