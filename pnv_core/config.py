@@ -53,7 +53,7 @@ class Config:
     )
     trunk_precision: str = setting(
         "float32",
-        "arithmetic of the network; bfloat16 is faster where the processor has it",
+        "arithmetic of the describing network; bfloat16 is faster where the processor has it",
         choices=("float32", "bfloat16"),
     )
     threads: int = setting(2, "threads of the network and of matching; 0 = all cores", low=0, high=256)
