@@ -32,7 +32,7 @@ from pnv_core.verify.verifier import Verifier
 from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
-CAUTION = 0.7  # what a false candidate counts in the fit: a fifth of it is a tower of floors that nobody tells apart
+CAUTION = 0.8  # what a false candidate counts in the fit: a fifth of it is a tower of floors that nobody tells apart
 _SURE_MOTION = 24  # SIFT features on one geometry, three times what chance gives
 
 
