@@ -312,7 +312,8 @@ def adapt_model(
             f"{len(pairs)} pairs of images show one place: too few to adapt to; allowed: {_LEAST_PAIRS} or more"
         )
     adapted = {part: adapted_projection(getattr(model, part), given, pairs) for part, given in inputs.items()}
-    return replace(model, patch_projection=model.patches_projection, **adapted)
+    adapted["patch_projection"] = model.patches_projection
+    return TorchModel(model.info, model.trunk, model.netvlad, **adapted)
 
 
 def fit_model(

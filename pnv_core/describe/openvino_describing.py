@@ -72,9 +72,9 @@ class OpenVinoDescribing:
 
 def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Model:
     """(1, H, W, 3) uint8 and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
-    pixels, *maps = _maps(model, size)
+    pixels, features, wide, deep = _maps(model, size)
     counted = ops.parameter([1, 1, *model.trunk.shape(*size)[1:]], np.float32)
-    return ov.Model(_described(model, *maps, counted, windows), [pixels, counted], "describing")
+    return ov.Model(_described(model, features, wide, deep, counted, windows), [pixels, counted], "describing")
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
