@@ -102,9 +102,13 @@ class Judge:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS
 
     def _background(self, match: ImageRef, around: Sequence[Candidate]) -> float:
-        """How similar other places are to the query: the fifth keyframe elsewhere, the middle one of a young map."""
+        """How similar other places are to the query: the fifth keyframe elsewhere.
+
+        Of a young map, where `around` is all there is, at least the middle one: the fifth of five is no measure.
+        """
         elsewhere = list(islice((s for ref, s in around if self._apart(ref, match)), _BACKGROUND))
-        return elsewhere[_BACKGROUND - 1] if len(elsewhere) >= _BACKGROUND else around[len(around) // 2][1]
+        fifth = elsewhere[_BACKGROUND - 1] if len(elsewhere) >= _BACKGROUND else -1.0
+        return fifth if len(around) >= AROUND else max(fifth, around[len(around) // 2][1])
 
     def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:
         """With the most support that any other place of the match's own sequence has."""
