@@ -200,7 +200,7 @@ def plot(results: Sequence[Result], path: Path) -> None:
         axes.set_title(f"{result.walk.name}: {result.before_m:.2f} m to {result.after_m:.2f} m", fontsize=11)
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")  # equal axes may stand out of the layout
     plt.close(figure)
 
 
