@@ -182,7 +182,6 @@ def reranking_row(dim: int, scorer: str, candidates: int, threads: int, rounds: 
         patch_strides=(1, 1, 1),
         patch_weights=WEIGHTS,
         scorer=scorer,
-        scale_weight=0.0,
         threads=threads,
     )
     sides["product"] = partial(Reranker(settings).scores, query, references)

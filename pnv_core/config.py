@@ -14,7 +14,6 @@ _PUBLISHED: dict[str, Any] = {
     "image_width": 640,
     "image_height": 480,
     "patch_precision": "float32",
-    "scale_weight": 0.0,
 }
 _SEVERAL_SIZES = _PUBLISHED | {
     "patch_sizes": (2, 5, 8),
@@ -94,12 +93,6 @@ class Config:
         "usac",
         "spatial score of patch matches: ransac as the authors run it, usac far sooner, rapid without a geometry",
         choices=("usac", "ransac", "rapid"),
-    )
-    scale_weight: float = setting(
-        0.3,
-        "share of its RANSAC score that a candidate seen from nearer or farther loses at most; 0 = the paper's score",
-        low=0.0,
-        high=1.0,
     )
     verifier: str = setting(
         "xfeat", "what examines the best candidates beside their patches: xfeat, or a registered name"

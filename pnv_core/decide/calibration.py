@@ -117,7 +117,8 @@ class Calibration:
     """P(same place) of candidates that only their patches speak for, and of those that local features verified.
 
     It holds for the settings it was fitted with that shape the evidence. What a file does not name is as it was for all
-    models before it was recorded: strides of 1, the default `scale_weight` and verifier, any fusion weights.
+    models before it was recorded: strides of 1, RootSIFT, any fusion weights, and spatial scores that fell by up to
+    `scale_weight` where the scale differed, which none does now.
     """
 
     patches: Logistic
@@ -128,7 +129,7 @@ class Calibration:
     source: str = ""  # what it was fitted on
     patch_strides: tuple[int, ...] = ()
     patch_weights: tuple[float, ...] = ()
-    scale_weight: float = 0.3
+    scale_weight: float = 0.0
     verifier: str = "rootsift"
 
     def probability(self, evidence: Evidence) -> float:
@@ -226,9 +227,9 @@ _LIKE = {"usac": "ransac"}  # finds its inliers but for a few, so a calibration 
 
 
 def _evidence_settings(config: Config) -> dict[str, Any]:
-    names = ("scorer", "patch_sizes", "patch_strides", "patch_weights", "scale_weight", "verifier")
+    names = ("scorer", "patch_sizes", "patch_strides", "patch_weights", "verifier")
     held = {name: getattr(config, name) for name in names} | {"image_size": (config.image_width, config.image_height)}
-    return held | {"scorer": _LIKE.get(config.scorer, config.scorer)}
+    return held | {"scorer": _LIKE.get(config.scorer, config.scorer), "scale_weight": 0.0}
 
 
 def _fit_logistic(

@@ -9,7 +9,7 @@ import math
 from pnv_core.config import Config
 from pnv_core.types import Evidence, LoopClosure
 
-_SPATIAL = 0.04  # of the logarithm of the spatial score, against the cosine
+_SPATIAL = 0.2  # of the logarithm of the spatial score, against the cosine
 _LEAST_SPATIAL = 0.01
 _LOCAL = 0.2  # of the logarithm of the local inliers
 _LEAST_LOCAL = 4  # and of what no local feature examined

@@ -11,7 +11,7 @@ from pnv_core.threads import workers
 from pnv_core.types import PatchMatches, PlaceDescriptor
 from pnv_core.verify.homography import homography_inliers, usac_inliers
 from pnv_core.verify.matching import Indices, mutual_nearest_rows, patch_rows
-from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score, scale_change
+from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_score
 
 Rows = NDArray[np.float32]  # patch descriptors made ready for matching
 
@@ -22,7 +22,7 @@ _SEARCHES = {"ransac": homography_inliers, "usac": usac_inliers}
 class SpatialResult:
     """Score in [0, 1], the paper's score and mutual matches of each patch size, and how many matches are inliers.
 
-    `score` is the fusion of `per_size`, less what `Config.scale_weight` takes off where the scale differs.
+    `score` is the fusion of `per_size`.
     With the rapid scorer no match is tested against a homography; `inliers` then counts the mutual matches.
     """
 
@@ -38,7 +38,6 @@ class Reranker:
     def __init__(self, config: Config) -> None:
         self.search = _SEARCHES.get(config.scorer)  # None: the rapid score, without a geometry
         self.weights = config.patch_weights
-        self.scale_weight = config.scale_weight
         self.workers = workers(config.threads)
 
     def score(self, query: PlaceDescriptor, reference: PlaceDescriptor) -> SpatialResult:
@@ -66,10 +65,7 @@ class Reranker:
             xy = q.keypoints()[pairs[0]], r.keypoints()[pairs[1]]
             found.append(PatchMatches(q.size, pairs[0], pairs[1], inlier, *xy))
         counted = sum(int(m.inlier.sum()) if self.search is not None else len(m.query) for m in found)
-        fused = fused_score(scores, self.weights)
-        if self.search is not None and self.scale_weight and fused:
-            fused *= 1.0 - self.scale_weight * scale_change(found)
-        return SpatialResult(fused, tuple(scores), tuple(found), counted)
+        return SpatialResult(fused_score(scores, self.weights), tuple(scores), tuple(found), counted)
 
 
 def _rows(descriptor: PlaceDescriptor) -> list[Rows]:

@@ -29,7 +29,7 @@ from pnv_lab.evaluation.store import DescriptorStore, Record, code_version, cont
 # every other setting, a new one too, is part of the key that a record is found by.
 _WITHOUT_EFFECT = (
     "preset", "min_interval_s", "min_change", "exclude_recent_s", "candidates", "time_budget_ms", "index", "scorer",
-    "patch_weights", "scale_weight", "verifier", "verify", "accept_score", "min_texture", "consistency", "sure_score",
+    "patch_weights", "verifier", "verify", "accept_score", "min_texture", "consistency", "sure_score",
     "odometry_drift", "odometry_slack_m", "min_travelled_m", "memory_budget_mb", "eviction", "patch_store",
     "patch_folder", "disk_budget_gb",
 )  # fmt: skip

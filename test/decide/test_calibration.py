@@ -151,6 +151,8 @@ def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
     assert calibration_for(stored, CONFIG.replace(scorer="rapid")) is CONSERVATIVE
     assert calibration_for(stored, CONFIG.replace(image_width=640)) is CONSERVATIVE
     assert calibration_for(None, CONFIG) is CONSERVATIVE
+    scaled = stored | {"scale_weight": 0.3}  # scores that fell with the change of scale are no longer
+    assert calibration_for(scaled, CONFIG) is CONSERVATIVE
     older = {name: value for name, value in stored.items() if name != "verifier"}  # when there was RootSIFT alone
     older["verified"] = {"bias": -4.0, "weights": {"spatial": 1.0, "local_inliers": 3.0}}
     assert calibration_for(older, CONFIG) is CONSERVATIVE
@@ -163,7 +165,6 @@ def test_a_calibration_holds_for_the_settings_that_shape_the_evidence_it_was_fit
     for change in (
         {"patch_strides": (1, 2)},
         {"patch_weights": (0.9, 0.1)},
-        {"scale_weight": 0.0},
         {"verifier": "another"},
     ):
         assert calibration_for(stored, CONFIG.replace(**change)) is CONSERVATIVE, change

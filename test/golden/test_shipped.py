@@ -105,7 +105,7 @@ def test_retrieval_finds_the_other_view_first(golden, described):
 
 @pytest.mark.parametrize("scorer", ["ransac", "rapid"])
 def test_fused_scores_are_the_convex_combination_over_patch_sizes(golden, described, scorer):
-    config = Config.make(**GEOMETRY, patch_strides=(1, 1, 1), scorer=scorer, scale_weight=0.0)
+    config = Config.make(**GEOMETRY, patch_strides=(1, 1, 1), scorer=scorer)
     for i, j in ((0, 0), (0, 1), (2, 3), (0, 2)):
         result = Reranker(config).score(described[i], described[j])
         if scorer == "rapid":

@@ -119,16 +119,22 @@ def test_a_changed_image_or_setting_is_described_anew(root: Path, tmp_path: Path
 
 
 def test_figures_follow_the_settings_whatever_was_cached_before(root: Path, tmp_path: Path) -> None:
-    """Queries seen from nearer: how much of their score the change of scale costs is a setting."""
+    """Queries seen from nearer: how much each patch size counts is a setting."""
     for seed in range(5):
         write(tmp_path / "near" / f"{seed}.png", cv2.resize(place(seed)[12:-12, 16:-16], place(seed).shape[1::-1]))
     (tmp_path / "matches.csv").write_text("query,true_refs\n" + "".join(f"{s}.png,{s}.png\n" for s in range(5)))
     dataset = pairs_dataset(tmp_path / "near", root / "map", tmp_path / "matches.csv")
     methods = parse_methods("multi-ransac")
-    full = answers(Evaluation(SMALL.replace(scale_weight=1.0), tmp_path / "cache", silent).run(dataset, methods))
-    none = answers(Evaluation(SMALL.replace(scale_weight=0.0), tmp_path / "cache", silent).run(dataset, methods))
-    assert none == answers(Evaluation(SMALL.replace(scale_weight=0.0), tmp_path / "new", silent).run(dataset, methods))
-    assert none != full
+    fine = answers(
+        Evaluation(SMALL.replace(patch_weights=(0.9, 0.1)), tmp_path / "cache", silent).run(dataset, methods)
+    )
+    coarse = answers(
+        Evaluation(SMALL.replace(patch_weights=(0.1, 0.9)), tmp_path / "cache", silent).run(dataset, methods)
+    )
+    assert coarse == answers(
+        Evaluation(SMALL.replace(patch_weights=(0.1, 0.9)), tmp_path / "new", silent).run(dataset, methods)
+    )
+    assert coarse != fine
 
 
 _OTHER = {
@@ -153,7 +159,7 @@ def test_a_setting_is_part_of_the_key_of_descriptors_or_out_of_their_reach(tmp_p
             told.append(name)
             assert CachedExtraction(second, tmp_path).store.folder != folder, name
     assert {"trunk_precision", "backend", "patch_sizes", "image_width", "patch_precision"} <= set(told)
-    assert not {"scale_weight", "accept_score", "memory_budget_mb", "candidates"} & set(told)  # described once for all
+    assert not {"scorer", "accept_score", "memory_budget_mb", "candidates"} & set(told)  # described once for all
 
 
 @pytest.mark.process
@@ -348,5 +354,5 @@ def test_a_preset_as_a_method_is_scored_as_the_recogniser_would():
             expected = Config.make(method.preset, threads=1, trunk_precision="bfloat16")
             assert method.config(base) == expected
             found, own = method.reranker(expected), Reranker(expected)
-            assert (found.search, found.weights, found.scale_weight) == (own.search, own.weights, own.scale_weight)
+            assert (found.search, found.weights) == (own.search, own.weights)
     assert {m.preset for m in parse_methods("presets")} >= {"performance", "balanced", "speed", "storage"}
