@@ -22,7 +22,7 @@ def ranked(closures: list[LoopClosure], config: Config) -> list[int]:
 
 
 ALIKE = [
-    closure(0, 0.60, 0.03),
+    closure(0, 0.60, 0.05),
     closure(1, 0.40, 0.09),
 ]  # another viewpoint of the place, and patches that look like it
 
