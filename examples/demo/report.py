@@ -20,7 +20,9 @@ from pnv_core.types import LoopClosure
 from pnv_core.verify.reranker import Reranker
 from pnv_lab.worlds import Sequence
 
-RADIUS_M, HEADING_DEG = 3.0, 40.0  # a closure is right within these
+RADIUS_M, HEADING_DEG = 3.0, 40.0  # a closure is right within these,
+SHARED_VIEW = 0.15  # or where each image has this share of its view in common: the least that those have
+RIGHT = f"within {RADIUS_M:g} m and {HEADING_DEG:g} degrees, or {SHARED_VIEW:.0%} of the view in common"
 LIGHT_AND_LINE = "the second lap has other light, another line and height"
 STAGES = " p50, p95, p99 [ms]"  # how the node's diagnostics name what a stage takes
 
@@ -34,6 +36,7 @@ class Run:
     names: dict[int, str] = field(default_factory=dict)  # by stamp
     sent: dict[int, float] = field(default_factory=dict)  # monotonic seconds by stamp
     first_stamp_ns: int | None = None
+    _right: dict[tuple[int, int], bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.truth is not None:
@@ -69,8 +72,12 @@ class Run:
         """Whether both images show one place; None where that is not known."""
         if self._places is None:
             return None
+        assert self.truth is not None
         numbers, places = self._places
-        return bool(places[numbers[closure.query.stamp_ns], numbers[closure.match.stamp_ns]])
+        pair = numbers[closure.query.stamp_ns], numbers[closure.match.stamp_ns]
+        if pair not in self._right:
+            self._right[pair] = bool(places[pair]) or self.truth.shared_view(*pair) >= SHARED_VIEW
+        return self._right[pair]
 
     def sentence(self) -> str:
         """The outcome in a line that one may repeat."""
@@ -156,7 +163,7 @@ def print_table(run: Run) -> None:
         "closures": f"{len(verdicts)}",
     }
     if run.truth is not None:
-        table["closures right"] = f"{verdicts.count(True)}   (within {RADIUS_M:g} m and {HEADING_DEG:g} degrees)"
+        table["closures right"] = f"{verdicts.count(True)}   ({RIGHT})"
         table["closures wrong"] = f"{verdicts.count(False)}"
     latency = run.latencies_ms
     if len(latency):

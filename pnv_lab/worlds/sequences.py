@@ -1,6 +1,7 @@
 """Worlds and walks through them: rendered frames with exact poses and known revisits."""
 
 from collections.abc import Iterator
+from collections.abc import Sequence as Sequence_
 from dataclasses import dataclass
 from functools import cached_property
 from zlib import crc32
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from pnv_core.errors import ConfigError
 from pnv_core.types import Frame
 from pnv_lab.worlds.light import Light, exposed, lit_texture
-from pnv_lab.worlds.rendering import Camera, Pose, depth_image, pyramid, rasterise, wrapped
+from pnv_lab.worlds.rendering import CAMERA_IN_BODY, Camera, Pose, depth_image, pyramid, rasterise, wrapped
 from pnv_lab.worlds.scenes import KINDS, Scene
 
 Array = NDArray[np.float64]
@@ -126,6 +127,16 @@ class Sequence:
         table: NDArray[np.bool_] = close & (np.abs(wrapped(yaw[:, None] - yaw[None])) <= np.deg2rad(heading_deg))
         return table
 
+    def shared_view(self, a: int, b: int, size: tuple[int, int] = (80, 60)) -> float:
+        """Share of what one frame shows that the other shows too, the lesser of both ways, in [0, 1].
+
+        By the exact depth at `size` (width, height): a surface point counts as seen where the other frame's depth there
+        is its own within 5 % and 10 cm. The sky counts for nothing.
+        """
+        camera, poses = Camera(*size), (self.poses[a], self.poses[b])
+        depths = [self.world.depth(pose, size).astype(float) for pose in poses]
+        return min(_seen_too(camera, poses, depths), _seen_too(camera, poses[::-1], depths[::-1]))
+
     def revisits(
         self, gap_s: float = 30.0, radius_m: float = 2.0, heading_deg: float = 40.0
     ) -> list[NDArray[np.int64]]:
@@ -134,6 +145,22 @@ class Sequence:
         older = stamps[None] <= stamps[:, None] - int(gap_s * 1e9)
         table = self.places(radius_m, heading_deg) & older
         return [np.flatnonzero(row) for row in table]
+
+
+def _seen_too(camera: Camera, poses: Sequence_[Pose], depths: Sequence_[Array]) -> float:
+    """Share of the surface points of the first pose's view that lie on what the second one sees."""
+    y, x = np.nonzero(depths[0])
+    if not len(x):
+        return 0.0
+    rays = np.column_stack([x, y, np.ones(len(x))]) @ np.linalg.inv(camera.matrix()).T
+    body = poses[0].matrix()
+    points = (rays * depths[0][y, x, None]) @ (body[:3, :3] @ CAMERA_IN_BODY).T + body[:3, 3]
+    pixels, depth = camera.project(points, poses[1])
+    u, v = np.rint(np.where(depth[:, None] > 0, pixels, -1)).astype(int).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    there = depths[1][v[inside], u[inside]]
+    seen = np.abs(there - depth[inside]) <= 0.05 * depth[inside] + 0.1
+    return float((seen & (there > 0)).sum() / len(x))
 
 
 def loop_sequence(

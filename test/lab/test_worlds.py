@@ -1,5 +1,7 @@
 """The rendered worlds: pinhole geometry, determinism, truth of revisits."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -132,3 +134,22 @@ def test_the_light_of_the_first_visit_differs_from_the_second() -> None:
     sequence = loop_sequence(3, "hall")
     assert sequence.lights[0] == Light(seed=3)
     assert sequence.lights[-1] != sequence.lights[0]
+
+
+@pytest.mark.parametrize("kind", ["corridor", "hall", "office", "street"])
+def test_frames_share_all_of_one_view_half_of_it_after_a_turn_and_nothing_back_to_back(kind: str) -> None:
+    """Of a turn on the spot the field of view (75 degrees) tells what stays in sight; the rows lose a little more."""
+    walk = loop_sequence(3, kind, laps=1.0, fps=0.5)
+    here = walk.poses[4]
+    for degrees in (0.0, 30.0, -37.5, 60.0, 180.0):
+        turned = replace(walk, poses=(here, replace(here, yaw=here.yaw + np.deg2rad(degrees))))
+        angle = 37.5 - abs(degrees)
+        in_sight = (1 + np.tan(np.deg2rad(angle)) / np.tan(np.deg2rad(37.5))) / 2 if abs(degrees) < 75 else 0.0
+        assert in_sight - 0.2 <= turned.shared_view(0, 1) <= in_sight + 0.05, degrees
+
+
+def test_frames_on_both_sides_of_a_wall_share_nothing_though_they_stand_close() -> None:
+    walk = loop_sequence(3, "corridor", laps=1.0, fps=0.5)
+    here = walk.poses[4]
+    beside = replace(here, y=here.y + 60.0)  # outside of the building
+    assert replace(walk, poses=(here, beside)).shared_view(0, 1) < 0.05
