@@ -30,7 +30,7 @@ _WARM = 3  # of these, not counted
 
 def latency(blocks: int, rate: float, images: Path | None) -> int:
     """0 where p95 with a fleet is within 10 % of p95 without."""
-    shown = pictures(images)
+    shown = pictures(images, 640, 480)
     with tempfile.TemporaryDirectory(prefix="pnv_fleet_") as scratch, served() as server, own_domain():
         folder = Path(scratch)
         fill_map(folder / "map", _KEYFRAMES, shown)
