@@ -21,7 +21,7 @@ from pnv_ros.node import PlaceRecognizerNode
 from pnv_ros.parameters import DECLARED
 
 UNUSABLE_INPUT = 2
-_ARENA_MAX, _MMAP_THRESHOLD = -8, -3  # malloc.h
+_ARENA_MAX = -8  # malloc.h
 
 
 class Spinning:
@@ -87,7 +87,7 @@ def main(args: list[str] | None = None) -> int:
         how = "allowed: parameters, as --ros-args -p NAME:=VALUE (--help lists them)"
         print(f"place_recognizer: {' '.join(others)}; {how}", file=sys.stderr)
         return UNUSABLE_INPUT
-    _return_memory()
+    _few_heaps()
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))
@@ -117,12 +117,11 @@ def main(args: list[str] | None = None) -> int:
         rclpy.try_shutdown()
 
 
-def _return_memory() -> None:
-    """glibc: two heaps for all threads, and what is large goes back to the system when it is freed."""
+def _few_heaps() -> None:
+    """glibc: two heaps for all threads."""
     with contextlib.suppress(OSError, AttributeError):  # another C library
         libc = ctypes.CDLL(None)
         libc.mallopt(_ARENA_MAX, 2)
-        libc.mallopt(_MMAP_THRESHOLD, 1 << 18)
 
 
 def _first_words(error: Exception) -> str:
