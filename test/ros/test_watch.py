@@ -38,6 +38,8 @@ def test_the_page_shows_scores_health_and_the_match_of_a_running_node(domain, tm
         with pytest.raises(urllib.error.HTTPError):
             fetched(f"{url}/etc/passwd")
         with running_node(min_change=0.0, **{"qos_overrides./camera/image_raw.subscription.reliability": "reliable"}):
+            # the page hears the node before the first picture is sent: discovery takes seconds on a busy machine
+            wait_until(lambda: "accept_score" in json.loads(fetched(f"{url}/state.json"))["values"], 60, "its health")
             assert publisher("--reliable", "--stamps", table, "--rate", "2", "--linger", "3").wait() == 0
             wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["queries"]) >= 3, 60, "queries on the page")
             wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["map"]["keyframes"]) >= 3, 30, "a map")
