@@ -107,7 +107,6 @@ class Describer:
         self.backend = backend_of(self.config)
         self.fingerprint = model.fingerprint()
         self._describing = _describing(model, self.config)
-        _ = model.clusters, model.global_dim, model.patch_dim
         model.release()
 
     @property

@@ -126,6 +126,7 @@ class Model:
     def release(self) -> None:
         """Give back the memory of tensors that a file has; they are read again where somebody asks for them."""
         if isinstance(self.tensors, _Stored):
+            _ = self.clusters, self.global_dim, self.patch_dim  # kept, so that no later question opens the file again
             self.tensors.close()
 
     def fingerprint(self) -> str:
