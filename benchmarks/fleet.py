@@ -111,31 +111,30 @@ def trajectories(count: int, seed: int = 0) -> Iterator[Array]:
         count -= len(run)
 
 
-def revisits(vectors: Array, count: int, seed: int = 1) -> Array:
-    """(count, D): stored places seen again, cosine about 0.75 to where they were."""
-    rng = np.random.default_rng(seed)
-    seen = vectors[rng.integers(0, len(vectors), count)]
-    noise = rng.standard_normal(seen.shape).astype(np.float32)
+def revisits(seen: Array, seed: int = 1) -> Array:
+    """(n, D) of stored places seen again: cosine about 0.75 to where they were."""
+    noise = np.random.default_rng(seed).standard_normal(seen.shape).astype(np.float32)
     seen = 0.75 * seen + 0.66 * noise / np.linalg.norm(noise, axis=1, keepdims=True)
     return seen / np.linalg.norm(seen, axis=1, keepdims=True)
 
 
-def scale(sizes: list[int], queries: int) -> None:
+def scale(sizes: list[int], queries: int, indexes: list[str]) -> None:
+    """Inserts go on under the first of the indexes; the others are built over the same rows."""
     import faiss
 
     from pnv_core.decide.judge import AROUND
     from pnv_fleet.places import Place
     from pnv_fleet.store import Access, PlaceStore
 
-    print(
-        "keyframes  insert/s  index and first query  query p50    p95  server busy  recall@10  server  on disk/keyframe"
-    )
+    print("keyframes  index      inserts/s  index and first search  search p50     p95  server busy  recall@10  server"
+          "  on disk/keyframe  load")  # fmt: skip
+    model = "5" * 64
     with served() as server:
-        store = PlaceStore(server.uri, "5" * 64, Access(), _DIM, 1, timeout_s=3600.0)
+        store = PlaceStore(server.uri, model, Access(), _DIM, 1, timeout_s=3600.0)
         exact = faiss.IndexFlatIP(_DIM)
         keys: list[str] = []
-        vectors: list[Array] = []
         for size in sorted(sizes):
+            _set_index(store, indexes[0])
             start, before = time.perf_counter(), len(keys)
             for number, run in enumerate(trajectories(size - len(keys), seed=len(keys))):
                 robot = f"robot_{number % 10}"
@@ -146,36 +145,49 @@ def scale(sizes: list[int], queries: int) -> None:
                 ]
                 store.put(places)
                 exact.add(run)
-                vectors.append(run)
                 keys += [place.key for place in places]
-            inserted = time.perf_counter() - start
+            inserted = (size - before) / (time.perf_counter() - start)
+            print(f"{len(keys)} inserted, {inserted:.0f} a second", file=sys.stderr)
             store._client.flush(store.collection, timeout=3600.0)
-            store.close()
-            server.kill()  # Milvus Lite builds the index of what is on disk when it loads it, not before
-            begin = time.perf_counter()
-            server.start()
-            server.wait()
-            store = PlaceStore(server.uri, "5" * 64, Access(), timeout_s=3600.0)
-            store.search(vectors[0][0], 10)
-            built = time.perf_counter() - begin
-            asked = revisits(np.concatenate(vectors), queries)
-            where = 'robot != "another" or stamp_ns < 0'  # as a node asks; here it leaves out none
-            times, right = [], 0
-            truth, busy = exact.search(asked, 10)[1], server.cpu_s()
-            for vector, best in zip(asked, truth, strict=True):
+            chosen = np.random.default_rng(1).integers(0, len(keys), queries)
+            asked = revisits(np.stack([exact.reconstruct(int(i)) for i in chosen]))
+            truth = exact.search(asked, 10)[1]
+            for index in indexes:
+                _set_index(store, index)
+                store.close()
+                server.kill()  # what is measured has come from the disk
                 begin = time.perf_counter()
-                hits, _ = store.search(vector, AROUND, where)  # as many as a node asks for
-                times.append(time.perf_counter() - begin)
-                right += len({hit.place.key for hit in hits[:10]} & {keys[i] for i in best})
-            ms, busy = 1e3 * np.array(times), 1e3 * (server.cpu_s() - busy) / queries
-            disk = sum(f.stat().st_size for f in server.folder.rglob("*") if f.is_file())
-            print(
-                f"{len(keys):>9}  {(size - before) / inserted:>8.0f}  {built:>18.0f} s  {np.median(ms):>6.1f} ms"
-                f"  {np.percentile(ms, 95):>5.1f}  {busy:>8.1f} ms  {right / 10 / queries:>9.3f}"
-                f"  {server.rss_mb():>4.0f} MB"
-                f"  {disk / len(keys):>6.0f} B",
-                flush=True,
-            )
+                server.start()
+                server.wait()
+                store = PlaceStore(server.uri, model, Access(), timeout_s=3600.0)
+                store.search(asked[0], 10)
+                built = time.perf_counter() - begin
+                where = 'robot != "another" or stamp_ns < 0'  # as a node asks; here it leaves out none
+                times, right, busy = [], 0, server.cpu_s()
+                for vector, best in zip(asked, truth, strict=True):
+                    begin = time.perf_counter()
+                    hits, _ = store.search(vector, AROUND, where)  # as many as a node asks for
+                    times.append(time.perf_counter() - begin)
+                    right += len({hit.place.key for hit in hits[:10]} & {keys[i] for i in best})
+                ms, busy = 1e3 * np.array(times), 1e3 * (server.cpu_s() - busy) / queries
+                disk = sum(f.stat().st_size for f in server.folder.rglob("*") if f.is_file())
+                print(
+                    f"{len(keys):>9}  {index:<9}  {inserted:>9.0f}  {built:>20.0f} s  {np.median(ms):>7.1f} ms"
+                    f"  {np.percentile(ms, 95):>6.1f}  {busy:>8.1f} ms  {right / 10 / queries:>9.3f}"
+                    f"  {server.rss_mb():>4.0f} MB  {disk / len(keys):>14.0f} B  {os.getloadavg()[0]:>4.1f}",
+                    flush=True,
+                )
+
+
+def _set_index(store: Any, kind: str) -> None:
+    client, name = store._client, store.collection
+    if client.describe_index(name, "vector")["index_type"] == kind:
+        return
+    client.release_collection(name)
+    client.drop_index(name, "vector")
+    index = client.prepare_index_params()
+    index.add_index("vector", index_type=kind, metric_type="COSINE")
+    client.create_index(name, index)  # not loaded: built by the server's next start
 
 
 def _like() -> PlaceDescriptor:
@@ -318,6 +330,9 @@ def main() -> int:
     sized = actions.add_parser("scale")
     sized.add_argument("--sizes", type=int, nargs="+", default=[10_000, 100_000])
     sized.add_argument("--queries", type=int, default=200)
+    sized.add_argument(
+        "--index", nargs="+", default=["AUTOINDEX"], help="as the server names them, one after the other"
+    )
     killing = actions.add_parser("kills")
     killing.add_argument("--kills", type=int, default=100)
     killing.add_argument("--longest", type=float, default=6.0, help="seconds between two of them, at most")
@@ -349,7 +364,7 @@ def main() -> int:
     if args.action == "robot":
         robot(args.uri, args.folder)
     elif args.action == "scale":
-        scale(args.sizes, args.queries)
+        scale(args.sizes, args.queries, args.index)
     return 0
 
 

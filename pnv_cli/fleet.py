@@ -40,8 +40,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
             action.add_argument("--since", metavar="UTC", help="taken from this moment on, as 2026-05-01T12:00")
             action.add_argument("--session", type=int, help="the session's first stamp in ns, as `status` shows")
             action.add_argument(
-                "--area", metavar="X,Y,R", help="taken in the square X +- R, Y +- R of the robots' poses, in m"
-            )
+                "--area", type=float, nargs=3, metavar=("X", "Y", "R"),
+                help="taken in the square X +- R, Y +- R of the robots' poses, in m",
+            )  # fmt: skip
         if name == "forget":
             action.add_argument("--older-than", type=float, metavar="DAYS", help="taken longer ago")
             action.add_argument("--covered", type=float, metavar="SIMILARITY", help="a newer place is as similar")

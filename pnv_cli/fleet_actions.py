@@ -1,6 +1,7 @@
 """What each action of `pnv fleet` does. Exit status as returned."""
 
 import argparse
+import math
 import time
 from datetime import datetime, timezone
 from pathlib import Path
@@ -22,7 +23,7 @@ from pnv_fleet.store import Access, PlaceStore
 def _opened(args: argparse.Namespace, create: bool = False) -> tuple[PlaceStore, Describer, PlaceDescriptor]:
     if not args.uri:
         raise ConfigError("no --uri given; allowed: http(s)://HOST:PORT, NAME.db, or PNV_FLEET_URI in the environment")
-    if not args.uri.startswith("http") and not create and not Path(args.uri).exists():
+    if args.uri.endswith(".db") and not args.uri.startswith("http") and not create and not Path(args.uri).exists():
         raise FleetError(f"{args.uri} does not exist; allowed: a store that `pnv fleet push` or a node made")
     describer = describer_from(config_from(args))
     width, height = describer.image_size
@@ -37,22 +38,28 @@ def _where(args: argparse.Namespace) -> str:
     if args.robot:
         terms.append(f'robot == "{robot_name(args.robot)}"')
     if args.session is not None:
+        if not 0 <= args.session < 2**63:
+            raise ConfigError(f"--session {args.session}; allowed: a stamp in ns, as `pnv fleet status` shows")
         terms.append(f"session == {args.session}")
     if args.since:
         try:
             moment = datetime.fromisoformat(args.since)
-        except ValueError:
-            raise ConfigError(f"--since {args.since}; allowed: a moment as 2026-05-01T12:00 (UTC)") from None
-        utc = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
-        terms.append(f"stamp_ns >= {int(utc.timestamp() * 1e9)}")
+            utc = moment if moment.tzinfo else moment.replace(tzinfo=timezone.utc)
+            since = int(utc.timestamp() * 1e9)
+        except (ValueError, OverflowError):
+            since = -1
+        if since < 0:
+            raise ConfigError(f"--since {args.since}; allowed: a moment since 1970 as 2026-05-01T12:00 (UTC)")
+        terms.append(f"stamp_ns >= {since}")
     if args.area:
-        try:
-            x, y, radius = (float(part) for part in args.area.split(","))
-        except ValueError:
-            raise ConfigError(f"--area {args.area}; allowed: X,Y,R in metres") from None
+        x, y, radius = args.area
+        if not all(map(math.isfinite, args.area)) or radius < 0:
+            raise ConfigError(f"--area {x:g} {y:g} {radius:g}; allowed: X Y R in metres")
         terms.append(f"posed == true and x >= {x - radius!r} and x <= {x + radius!r}")
         terms.append(f"y >= {y - radius!r} and y <= {y + radius!r}")
     if getattr(args, "older_than", None) is not None:
+        if not 0 <= args.older_than < 1e6:
+            raise ConfigError(f"--older-than {args.older_than:g}; allowed: 0 to 1000000 days")
         terms.append(f"stamp_ns < {int((time.time() - args.older_than * 86400) * 1e9)}")
     return " and ".join(terms)
 
@@ -60,10 +67,15 @@ def _where(args: argparse.Namespace) -> str:
 def _status(args: argparse.Namespace) -> int:
     store, _, _ = _opened(args)
     print(f"{store.uri}: {store.version()}, collection {store.collection}, {store.count()} places")
-    print(f"{'robot':<24}{'places':>9}{'sessions':>10}  first and last (UTC)")
-    for robot, (count, sessions, first, last) in maps.robots(store).items():
-        span = " to ".join(datetime.fromtimestamp(s / 1e9, timezone.utc).strftime("%F %T") for s in (first, last))
-        print(f"{robot:<24}{count:>9}{sessions:>10}  {span}")
+    print(f"{'robot':<24}{'session':>20}{'places':>9}  first and last (UTC)")
+    found = maps.sessions(store)
+    for robot in dict.fromkeys(robot for robot, _ in found):
+        own = {session: what for (of, session), what in found.items() if of == robot}
+        for session, (count, first, last) in own.items():
+            span = " to ".join(datetime.fromtimestamp(s / 1e9, timezone.utc).strftime("%F %T") for s in (first, last))
+            print(f"{robot:<24}{session:>20}{count:>9}  {span}")
+        if len(own) > 1:
+            print(f"{robot:<24}{f'{len(own)} sessions':>20}{sum(count for count, _, _ in own.values()):>9}")
     return 0
 
 
@@ -105,8 +117,10 @@ def _forget(args: argparse.Namespace) -> int:
     if not where and args.covered is None and not args.all:
         raise ConfigError("nothing is named to forget; allowed: --robot, --session, --since, --area, --older-than, "
                           "--covered or --all")  # fmt: skip
+    if args.covered is not None and not -1 <= args.covered <= 1:
+        raise ConfigError(f"--covered {args.covered:g}; allowed: a similarity, -1 to 1")
     store, _, _ = _opened(args)
-    count = maps.thin(store, args.covered) if args.covered is not None else store.forget(where or 'key != ""')
+    count = maps.thin(store, args.covered, where) if args.covered is not None else store.forget(where or 'key != ""')
     print(f"{store.uri}: forgot {count} places, {store.count()} are left")
     return 0
 

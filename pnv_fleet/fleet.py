@@ -349,7 +349,14 @@ class Fleet:
             if pending or not self._outbox.unanswered(w.place.key):  # `ask` marks it before it lets go of it
                 continue
             place = w.place
-            query = Query(place.ref, descriptor_of(place, self._like), w.predecessor)
+            try:
+                seen = descriptor_of(place, self._like)
+            except FleetError as error:  # of another release: it would never go
+                self._say(f"fleet: dropped keyframe {place.keyframe} of the outbox: {error}")
+                self._tally(lost=1)
+                self._outbox.drop(place.key)
+                continue
+            query = Query(place.ref, seen, w.predecessor)
             asked = _Asked(query, place, self._where(place.stamp_ns, place.session), -math.inf)
             if self._ended.is_set() or not self._answer(self._lanes[1], asked):
                 return []

@@ -1,6 +1,5 @@
 """Saved maps and the fleet: a map goes up, a selection comes down, the store is looked through and thinned."""
 
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -84,25 +83,23 @@ def _keyframes(places: list[Place], like: PlaceDescriptor) -> Iterator[SavedKeyf
         yield SavedKeyframe(ref, place.vector, layouts, np.frombuffer(buffer, np.uint8), place.texture)
 
 
-def robots(store: PlaceStore) -> dict[str, tuple[int, int, int, int]]:
-    """Per robot: places, sessions, first and last stamp in ns."""
-    counts: Counter[str] = Counter()
-    sessions: dict[str, set[int]] = {}
-    first: dict[str, int] = {}
-    latest: dict[str, int] = {}
+def sessions(store: PlaceStore) -> dict[tuple[str, int], tuple[int, int, int]]:
+    """Per robot and session (its first stamp in ns): places, first and last stamp in ns."""
+    found: dict[tuple[str, int], tuple[int, int, int]] = {}
     for place in store.scan():
         if not isinstance(place, str):
-            counts[place.robot] += 1
-            sessions.setdefault(place.robot, set()).add(place.session)
-            first[place.robot] = min(place.stamp_ns, first.get(place.robot, place.stamp_ns))
-            latest[place.robot] = max(place.stamp_ns, latest.get(place.robot, 0))
-    return {r: (counts[r], len(sessions[r]), first[r], latest[r]) for r in sorted(counts)}
+            count, first, last = found.get((place.robot, place.session), (0, place.stamp_ns, 0))
+            found[place.robot, place.session] = count + 1, min(first, place.stamp_ns), max(last, place.stamp_ns)
+    return dict(sorted(found.items()))
 
 
-def thin(store: PlaceStore, similarity: float) -> int:
-    """Forget every place of which a newer one is at least so similar. Gives their number."""
+def thin(store: PlaceStore, similarity: float, where: str = "") -> int:
+    """Forget the places that fulfil an expression and of which a newer one, of any robot, is at least so similar.
+
+    Gives their number.
+    """
     gone: set[str] = set()
-    places = [p for p in store.scan() if not isinstance(p, str)]
+    places = [p for p in store.scan(where) if not isinstance(p, str)]
     for place in sorted(places, key=lambda p: p.stamp_ns):
         full = store.fetch([place.key])[0].get(place.key)
         if full is None:

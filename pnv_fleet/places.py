@@ -121,11 +121,7 @@ def decode_view(view: bytes, expected: tuple[GridLayout, ...] | None = None) -> 
 
     `expected` are the layouts of this model's keyframes, where they are known.
     """
-    if len(view) < _HEAD.size or view[:4] != _MAGIC:
-        raise FleetError(f"a view of {len(view)} bytes without its mark")
-    _, crc, length = _HEAD.unpack_from(view)
-    if zlib.crc32(memoryview(view)[8:]) != crc:
-        raise FleetError("a view whose checksum is wrong")
+    length = _check(view)
     layouts = _layouts(view[_HEAD.size : _HEAD.size + length])
     if expected is not None and layouts != expected:
         raise FleetError("a view with patches of another shape than this model's")
@@ -143,6 +139,16 @@ def decode_view(view: bytes, expected: tuple[GridLayout, ...] | None = None) -> 
         except ValueError as error:
             raise FleetError(f"a view with {error}") from None
     return layouts, buffer
+
+
+def _check(view: bytes) -> int:
+    """Length of the JSON of a view that is as it was written. Raises FleetError."""
+    if len(view) < _HEAD.size or view[:4] != _MAGIC:
+        raise FleetError(f"a view of {len(view)} bytes without its mark")
+    _, crc, length = _HEAD.unpack_from(view)
+    if zlib.crc32(memoryview(view)[8:]) != crc:
+        raise FleetError("a view whose checksum is wrong")
+    return int(length)
 
 
 def _layouts(text: bytes) -> tuple[GridLayout, ...]:
@@ -278,4 +284,6 @@ def from_bytes(data: bytes) -> Place:
         row |= dict(zip("xyz", position or (), strict=False))
     except (struct.error, ValueError, TypeError, RecursionError) as error:
         raise FleetError(f"a keyframe in the outbox is damaged ({type(error).__name__})") from None
-    return replace(from_row(row, dim), view=data[4 + length + 4 * dim :])
+    view = data[4 + length + 4 * dim :]
+    _check(view)
+    return replace(from_row(row, dim), view=view)

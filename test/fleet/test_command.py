@@ -8,6 +8,8 @@ from pnv_core.describe.describer import load_describer
 from pnv_core.maps import MapStore
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame
+from pnv_fleet.places import Place, encode_view, layouts_of, parts_of
+from pnv_fleet.store import Access, PlaceStore
 from test.ros.camera import scene
 
 SECOND = 10**9
@@ -52,6 +54,56 @@ def test_a_map_goes_up_is_queried_comes_down_and_is_forgotten(server, tmp_path, 
     assert main(["fleet", "push", str(tmp_path / "up.map"), "--robot", "alpha", *uri, *other]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert "was made with model" in line
+
+
+def places_of(server, robots):
+    describer = load_describer("default")
+    width, height = describer.image_size
+    like = describer.describe(np.zeros((height, width, 3), np.uint8))
+    store = PlaceStore(
+        server.uri, describer.map_fingerprint, Access(), len(like.global_vector), parts_of(layouts_of(like))
+    )
+    store.forget('key != ""')
+    vector = like.global_vector
+    for robot in robots:
+        store.put([
+            Place(robot, SECOND, "front", n, (1 + n) * SECOND, 0.5, vector, encode_view(like), (-5.0, float(n), 0.0))
+            for n in range(3)
+        ])  # fmt: skip
+    return store
+
+
+def test_covered_places_are_forgotten_of_the_robot_that_is_named(server, capsys):
+    store = places_of(server, ("alpha", "beta"))
+    assert main(["fleet", "forget", "--robot", "alpha", "--covered", "0.95", "--uri", server.uri]) == 0
+    assert "forgot 2 places, 4 are left" in capsys.readouterr().out
+    assert sorted(p.robot for p in store.scan()) == ["alpha", "beta", "beta", "beta"]
+
+
+def test_an_area_may_lie_on_either_side_of_the_origin(server, capsys):
+    places_of(server, ("alpha",))
+    assert main(["fleet", "forget", "--area", "-5", "0", "1.5", "--uri", server.uri]) == 0
+    assert "forgot 2 places, 1 are left" in capsys.readouterr().out
+
+
+def test_status_names_the_sessions_that_forget_takes(server, capsys):
+    places_of(server, ("alpha",))
+    assert main(["fleet", "status", "--uri", server.uri]) == 0
+    assert str(SECOND) in capsys.readouterr().out.split("\n", 2)[2]
+
+
+def test_numbers_that_select_nothing_sensible_are_one_line(server, capsys):
+    places_of(server, ("alpha",))
+    for flags in (
+        ["--older-than", "nan"], ["--older-than", "inf"], ["--older-than", "-1"], ["--covered", "nan"],
+        ["--covered", "2"], ["--area", "nan", "0", "1"], ["--area", "0", "0", "-1"], ["--session", "-1"],
+        ["--since", "0001-01-01T00:00+14:00"], ["--robot", 'a" or key != "'],
+    ):  # fmt: skip
+        assert main(["fleet", "forget", *flags, "--uri", server.uri]) == 2, flags
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "allowed" in line, line
+    assert main(["fleet", "status", "--uri", server.uri]) == 0
+    assert ", 3 places" in capsys.readouterr().out
 
 
 def test_no_store_and_a_store_that_is_not_there_are_one_line(tmp_path, capsys):

@@ -10,10 +10,11 @@ import pytest
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_fleet.errors import FleetError
 from pnv_fleet.fleet import Fleet, Options
+from pnv_fleet.outbox import Outbox
 from pnv_fleet.places import layouts_of, parts_of
 from pnv_fleet.store import Access, PlaceStore
 from test.core.small import noise_image, small_describer
-from test.fleet.worlds import new_model
+from test.fleet.worlds import new_model, place
 from test.ros.camera import scene
 from test.ros.processes import wait_until
 
@@ -168,6 +169,26 @@ def test_places_of_long_ago_are_forgotten_but_not_those_of_others(server, tmp_pa
     assert any("forgot 3 places older than 1 days" in line for line in later.lines)
     for robot in (other, later):
         robot.fleet.close()
+
+
+def test_a_keyframe_of_other_patches_in_the_outbox_does_not_stop_the_others(server, tmp_path):
+    before = Outbox(tmp_path / "alpha.outbox", 100.0)
+    before.add(
+        replace(
+            place(7),
+            vector=np.eye(1, len(small_describer(**SETTINGS).describe(noise_image(0)).global_vector), dtype=np.float32)[
+                0
+            ],
+        ),
+        1.0,
+    )
+    before.close()
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(1, 2)
+    alpha.settled()
+    assert (alpha.status.sent, alpha.status.dropped) == (2, 1)
+    assert any("another shape" in line for line in alpha.lines)
+    alpha.fleet.close()
 
 
 def test_no_more_is_sent_than_the_limit_allows(server, tmp_path):

@@ -138,6 +138,23 @@ def test_a_damaged_entry_is_dropped_and_the_others_go_on(tmp_path):
     again.close()
 
 
+def test_a_flipped_bit_in_patches_is_damage(tmp_path):
+    outbox = Outbox(tmp_path / "box", 1.0)
+    for number in range(3):
+        outbox.add(place(number), 1.0)
+    outbox.close()
+    file = sqlite3.connect(tmp_path / "box")
+    data = bytearray(file.execute("SELECT place FROM places WHERE number = 2").fetchone()[0])
+    data[-20] ^= 1
+    file.execute("UPDATE places SET place = ? WHERE number = 2", (bytes(data),))
+    file.commit()
+    file.close()
+    again = Outbox(tmp_path / "box", 1.0)
+    assert ids(again) == [0, 2]
+    assert again.dropped == 1
+    again.close()
+
+
 def test_a_full_disk_is_said_and_what_was_kept_stays(tmp_path):
     outbox = Outbox(tmp_path / "box", 10.0)
     outbox.add(place(0), 1.0)
