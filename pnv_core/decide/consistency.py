@@ -59,19 +59,26 @@ class SequenceMemory:
     def path(self, closure: LoopClosure, window: int) -> Path:
         """The best path that ends at a closure, over this query (remembered last) and the `window` - 1 before it."""
         earlier = list(self._queries.get(closure.query.camera, ()))[:-1][-(window - 1) :] if window > 1 else []
-        return max((self._followed(closure, earlier, way) for way in (1, -1)), key=lambda p: (p.length, p.belief))
+        placed = [self._placed(candidates, closure.match) for candidates in earlier]
+        return max((self._followed(closure, placed, way) for way in (1, -1)), key=lambda p: (p.length, p.belief))
 
-    def _followed(self, closure: LoopClosure, earlier: list[tuple[LoopClosure, ...]], way: int) -> Path:
+    def _placed(self, candidates: Sequence[LoopClosure], match: ImageRef) -> list[tuple[int, LoopClosure]]:
+        """Those of the match's own sequence, each with the steps from it to the match."""
+        own = (match.robot, match.session, match.camera)
+        same = (c for c in candidates if (c.match.robot, c.match.session, c.match.camera) == own)
+        return [(self._steps(c.match, match), c) for c in same]
+
+    def _followed(self, closure: LoopClosure, earlier: list[list[tuple[int, LoopClosure]]], way: int) -> Path:
         """Backwards through the queries: of the matches in order and reach, take the best; a query may be missed."""
-        at, length, steps, moved = closure.match, 1, 1, False
+        at, behind, length, steps, moved = closure.match, 0, 1, 1, False
         total, here = 0.0, _evidence(closure.score)  # the same picture again is one witness, heard at its best
         for candidates in reversed(earlier):
-            following = [c for c in candidates if self._follows(c.match, at, way, steps)]
+            following = [(s, c) for s, c in candidates if 0 <= way * (s - behind) <= _STEP * steps]
             if not following:
                 steps += 1
                 total += _MISS
                 continue
-            best = max(following, key=lambda c: (c.score, c.match.id != at.id, -abs(self._steps(c.match, at))))
+            behind, best = max(following, key=lambda p: (p[1].score, p[1].match.id != at.id, -abs(p[0] - behind)))
             if best.match.id == at.id:
                 here = max(here, _evidence(best.score))
             else:
@@ -80,11 +87,6 @@ class SequenceMemory:
         if not moved:  # the other visit stood still
             length, total, here = 1, 0.0, _evidence(closure.score)
         return Path(length, _probability(_log_odds(PRIOR) + total + here), way if moved else 0)
-
-    def _follows(self, earlier: ImageRef, later: ImageRef, way: int, queries: int) -> bool:
-        """Whether `earlier` may be matched by the query `queries` before the one that matched `later`."""
-        same = (earlier.robot, earlier.session, earlier.camera) == (later.robot, later.session, later.camera)
-        return same and 0 <= way * self._steps(earlier, later) <= _STEP * queries
 
 
 def _log_odds(probability: float) -> float:

@@ -1,5 +1,6 @@
 """What speaks for each candidate, weighed: patches first, then local features of the best ones, then P(same place)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
@@ -16,6 +17,7 @@ from pnv_core.verify.verifier import VERIFIERS, hull_area
 
 _NEIGHBOURS = 10  # keyframes of a sequence this close to each other show one place
 AROUND = 50  # most similar keyframes to be known for the background
+_ON_A_LINE = 1e8  # ratio of the largest to the least scatter
 _BACKGROUND = 5  # the first few elsewhere may be the place itself on another lap
 
 Candidate = tuple[ImageRef, float]  # keyframe, similarity
@@ -54,13 +56,14 @@ class Judge:
         found = []
         for number, (result, reference) in enumerate(zip(scored, references, strict=True)):
             ref, similarity = candidates[number]
+            spread, distortion = spread_and_distortion(descriptor, result.matches)
             elsewhere = [i for i, (other, _) in enumerate(candidates) if self._apart(other, ref)]
             evidence = Evidence(
                 similarity=similarity,
                 spatial=result.score,
                 inliers=result.inliers,
-                spread=spread(descriptor, reference, result.matches),
-                distortion=distortion(descriptor, reference, result.matches),
+                spread=spread,
+                distortion=distortion,
                 lead=min((similarity - candidates[i][1] for i in elsewhere), default=0.0),
                 recent_lead=similarity - predecessor,
                 spatial_lead=min((result.score - scored[i].score for i in elsewhere if i < len(scored)), default=0.0),
@@ -141,37 +144,43 @@ def _not_reranked(query: ImageRef, match: ImageRef, similarity: float, texture: 
     return LoopClosure(query, match, 0.0, similarity, 0.0, 0, False, Reason.NOT_RERANKED, evidence=evidence)
 
 
-def _inlier_points(
-    query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]
-) -> tuple[np.ndarray, np.ndarray]:
+def _inlier_points(matches: Sequence[PatchMatches]) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2), (N, 2) pixels of the inliers of every patch size, pooled; all matches where none was tested."""
     pairs = []
-    for q, r, m in zip(query.patches, reference.patches, matches, strict=True):
-        use = m.inlier if m.inlier.any() else np.ones(len(m.query), bool)
-        pairs.append((q.keypoints()[m.query[use]], r.keypoints()[m.reference[use]]))
+    for m in matches:
+        use = m.inlier if m.inlier.any() else slice(None)
+        pairs.append((m.query_xy[use], m.reference_xy[use]))
     return np.concatenate([p for p, _ in pairs]), np.concatenate([p for _, p in pairs])
 
 
-def spread(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
-    """Convex hull of the patch inliers as a share of what the patch centres span, the smaller of both images."""
-    q, r = _inlier_points(query, reference, matches)
-    centres = max(query.patches, key=lambda grid: len(grid.descriptors)).keypoints()
-    span = float(np.ptp(centres, axis=0).prod())
-    return min(hull_area(q), hull_area(r)) / span if span else 0.0
+def spread_and_distortion(query: PlaceDescriptor, matches: Sequence[PatchMatches]) -> tuple[float, float]:
+    """Of the patch inliers: how far they reach, and how far the affine map from reference to query is from a shift.
 
-
-def distortion(query: PlaceDescriptor, reference: PlaceDescriptor, matches: Sequence[PatchMatches]) -> float:
-    """How far the affine map from reference to query is from a shift: the Frobenius norm of its linear part less I.
-
-    A robot back at a place sees it little rotated and scaled; chance matches shrink to a point, mirror or shear.
-    Infinite for fewer than three inliers or inliers on a line.
+    Spread is their convex hull as a share of what the patch centres span, the smaller of both images; distortion the
+    Frobenius norm of the map's linear part less I. A robot back at a place sees it little rotated and scaled; chance
+    matches shrink to a point, mirror or shear. Infinite for fewer than three inliers or inliers on a line.
     """
-    q, r = _inlier_points(query, reference, matches)
+    q, r = _inlier_points(matches)
+    span = _span(query)
+    return min(hull_area(q), hull_area(r)) / span if span else 0.0, _distortion(q, r)
+
+
+def _span(descriptor: PlaceDescriptor) -> float:
+    """Square pixels between the outermost centres of the size with most patches."""
+    grid = max(descriptor.patches, key=lambda grid: len(grid.descriptors))
+    return float((grid.rows - 1) * (grid.cols - 1) * (grid.cell * grid.stride) ** 2)
+
+
+def _distortion(q: np.ndarray, r: np.ndarray) -> float:
+    """Of (N, 2) inliers each; the normal equations of the affine map solved by hand."""
     if len(q) < 3:
         return float("inf")
-    centred = r - r.mean(0)
-    scatter = centred.T @ centred
-    if np.linalg.cond(scatter) > 1e8:
+    centred = r - r.sum(0) / len(r)
+    (a, b), (_, d) = centred.T @ centred
+    determinant = a * d - b * b
+    largest = (a + d + math.hypot(a - d, 2.0 * b)) / 2  # eigenvalue; their product is the determinant
+    if not largest * largest < _ON_A_LINE * determinant:
         return float("inf")
-    linear = np.linalg.solve(scatter, centred.T @ (q - q.mean(0)))
-    return float(np.linalg.norm(linear - np.eye(2)))
+    (e, f), (g, h) = centred.T @ q  # as of q centred: the columns of `centred` sum to zero
+    residual = d * e - b * g - determinant, d * f - b * h, a * g - b * e, a * h - b * f - determinant
+    return math.hypot(*residual) / float(determinant)

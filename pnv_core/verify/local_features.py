@@ -21,6 +21,7 @@ from pnv_core.config import Config
 from pnv_core.describe.download import cache_folder
 from pnv_core.threads import Workers
 from pnv_core.verify.feature_codes import features_only, pack, packed, picture_of, unpack
+from pnv_core.verify.matching import mutual_maxima, similarities
 from pnv_core.verify.verifier import EpipolarCheck, hull_area
 
 WIDTH = 640  # pixels of the longer side; night against day needs it
@@ -50,7 +51,7 @@ class LocalFeatures:
 
         Small where the image repeats itself, or is blurred. Two features at least.
         """
-        similarity = self.descriptors @ self.descriptors.T
+        similarity = similarities(self.descriptors, self.descriptors)
         np.fill_diagonal(similarity, -1.0)
         return 1.0 - float(similarity.max(1).mean())
 
@@ -88,13 +89,11 @@ def match(
     """Mutual nearest neighbours, as numbers (query, reference), and which of them are distinct (Lowe's ratio test)."""
     if min(len(query.points), len(reference.points)) < 2:
         return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, bool)
-    similarity = query.descriptors @ reference.descriptors.T
-    best = similarity.argmax(1)
-    mutual = np.flatnonzero(similarity.argmax(0)[best] == np.arange(len(best)))
-    best = best[mutual]
+    similarity = similarities(query.descriptors, reference.descriptors)
+    best, mutual = mutual_maxima(similarity)
     first = similarity[mutual, best]
     similarity[mutual, best] = -1.0
-    second = np.maximum(similarity[mutual].max(1), similarity[:, best].max(0))
+    second = np.maximum(similarity.max(1)[mutual], similarity.max(0)[best])
     return mutual, best, (1.0 - first < _RATIO**2 * (1.0 - second)) & (second < _TWIN)
 
 

@@ -1,10 +1,13 @@
 """Mutual nearest neighbours between patch descriptors. n_q, n_r patches of query and reference, D dimensions."""
 
+import threading
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Indices = NDArray[np.int64]
+_memory = threading.local()
 
 
 def patch_rows(descriptors: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -27,8 +30,35 @@ def mutual_nearest_rows(query: NDArray[np.float32], reference: NDArray[np.float3
     """As mutual_nearest, of prepared rows."""
     if not len(query) or not len(reference):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    similarity = reference @ query.T
-    forward = np.where(reference.any(1), similarity.argmax(1), -1)
-    backward = np.where(query.any(1), similarity.argmax(0), -1)
-    matched = np.flatnonzero((forward >= 0) & (backward[forward] == np.arange(len(forward))))
-    return forward[matched], matched
+    return mutual_maxima(similarities(reference, query))
+
+
+def mutual_maxima(similarity: NDArray[np.float32]) -> tuple[Indices, Indices]:
+    """(R, Q) -> columns and rows of what is the largest of its row and of its column, by row; the first of equal ones.
+
+    Rows and columns of nothing but zeros have none.
+    """
+    forward = similarity.argmax(1)
+    highest = similarity[np.arange(len(forward)), forward]
+    of_column = similarity.max(0)
+    matched = np.flatnonzero(highest == of_column[forward])
+    columns = forward[matched]
+    # numpy finds the place of a column's maximum at three times the cost of its value, which decides alone
+    # unless two are equal, or all is zero
+    if np.count_nonzero(similarity == of_column) > len(of_column) or not (highest.all() and of_column.all()):
+        backward = similarity.argmax(0)
+        kept = (backward[columns] == matched) & similarity[matched].any(1) & similarity[:, columns].any(0)
+        return columns[kept], matched[kept]
+    return columns, matched
+
+
+def similarities(rows: NDArray[np.float32], columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(R, D), (Q, D) -> their products (R, Q), in memory of this thread that the next call overwrites.
+
+    Memory allocated anew each time costs as much again in page faults.
+    """
+    size = len(rows) * len(columns)
+    held: NDArray[np.float32] | None = getattr(_memory, "held", None)
+    if held is None or held.size < size:
+        held = _memory.held = np.empty(size, np.float32)
+    return np.matmul(rows, columns.T, out=held[:size].reshape(len(rows), len(columns)))

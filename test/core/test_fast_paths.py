@@ -25,7 +25,7 @@ from pnv_core.threads import spans, workers
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, Reason
 from pnv_core.verify.homography import homography_inliers, usac_inliers
-from pnv_core.verify.matching import mutual_nearest, patch_rows
+from pnv_core.verify.matching import mutual_maxima, mutual_nearest, patch_rows
 from pnv_core.verify.reranker import Reranker
 from test.core.small import HEIGHT, WIDTH, small_describer
 
@@ -171,6 +171,23 @@ def test_screened_matches_are_the_exact_ones(seed, shape, dim, closeness, half):
         assert min(gaps) < 1e-6
 
 
+@given(
+    table=st.integers(1, 9).flatmap(
+        lambda q: st.lists(st.lists(st.integers(-2, 2), min_size=q, max_size=q), min_size=1, max_size=9)
+    )
+)
+def test_of_equal_similarities_the_first_wins_and_zeros_match_nothing(table):
+    similarity = np.array(table, np.float32)
+    columns = list(zip(*table, strict=True))
+    expected = [
+        (row.index(max(row)), j)
+        for j, row in enumerate(table)
+        if any(row) and any(columns[row.index(max(row))]) and columns[row.index(max(row))].index(max(row)) == j
+        and max(columns[row.index(max(row))]) == max(row)
+    ]  # fmt: skip
+    assert list(zip(*(side.tolist() for side in mutual_maxima(similarity)), strict=True)) == expected
+
+
 def test_halves_are_unpacked_to_the_bit():
     values = np.arange(2**16, dtype=np.uint16).view(np.float16)
     finite = values[np.isfinite(values)].reshape(-1, 2)
@@ -263,17 +280,16 @@ class Clock:
 def test_a_time_budget_allows_as_many_candidates_as_fit():
     clock = Clock()
     budget = TimeBudget(clock)
-    budget.start()
-    assert budget.affordable(20, 0.05) == 20  # nothing is known yet
+    assert budget.affordable(20, 0.05, budget.now()) == 20  # nothing is known yet
     with budget.taken(10):
         clock.now += 0.1  # 10 ms each
-    budget.start()
+    began = budget.now()
     clock.now += 0.02
-    assert budget.affordable(20, 0.0) == 20  # no budget
-    assert budget.affordable(20, 0.1001) == 8
-    assert budget.affordable(5, 0.1001) == 5
-    assert budget.affordable(20, 0.001) == 1  # never none
-    assert TimeBudget(None).affordable(20, 0.001) == 20
+    assert budget.affordable(20, 0.0, began) == 20  # no budget
+    assert budget.affordable(20, 0.1001, began) == 8
+    assert budget.affordable(5, 0.1001, began) == 5
+    assert budget.affordable(20, 0.001, began) == 1  # never none
+    assert TimeBudget(None).affordable(20, 0.001, 0.0) == 20
 
 
 def test_candidates_beyond_the_budget_are_reported_as_not_re_ranked():

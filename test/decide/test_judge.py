@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from pnv_core.decide.judge import spread_and_distortion
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.types import Frame
+from pnv_core.types import Frame, PatchGrid, PatchMatches, PlaceDescriptor
 from test.core.small import noise_image, small_describer
 
 S = 1_000_000_000
@@ -26,3 +27,36 @@ def test_the_background_is_the_fifth_most_similar_keyframe_elsewhere(places):
         middle = sorted(similarity, reverse=True)[places // 2]  # what counts where all of eight are neighbours
         expected = max(elsewhere[4], middle) if elsewhere else middle
         assert closure.evidence.background == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_spread_and_distortion_are_those_of_least_squares_and_of_a_polygon(seed):
+    """Against numpy's least squares and the shoelace formula of a convex polygon of inliers."""
+    rng = np.random.default_rng(seed)
+    grid = PatchGrid(2, 10, 12, np.zeros((120, 4), np.float32))
+    inside = rng.uniform(-1, 1, (6, 2)) * 20 + 100
+    corners = np.array([[40, 50], [170, 40], [180, 130], [50, 140]]) + rng.integers(-9, 9, (4, 2))
+    there = np.concatenate([corners, inside.astype(int)])
+    here = np.rint(there @ (np.eye(2) + rng.normal(size=(2, 2)) / 20) + [5, -3]).astype(int)
+    wrong = rng.integers(0, 190, (3, 2))
+    inlier = np.arange(13) < 10
+    number = np.arange(13)
+    found = PatchMatches(2, number, number, inlier, np.concatenate([here, wrong]), np.concatenate([there, wrong]))
+    spread, distortion = spread_and_distortion(PlaceDescriptor(np.zeros(4, np.float32), (grid,)), [found])
+    solved = np.linalg.lstsq(np.column_stack([there, np.ones(10)]), here, rcond=None)[0][:2]
+    assert distortion == pytest.approx(np.linalg.norm(solved - np.eye(2)), rel=1e-9)
+    areas = [
+        abs(sum(a[0] * b[1] - a[1] * b[0] for a, b in zip(p, np.roll(p, -1, 0), strict=True))) / 2
+        for p in (here[:4].astype(float), there[:4].astype(float))
+    ]
+    assert spread == pytest.approx(min(areas) / (11 * 16 * 9 * 16), rel=1e-6)
+
+
+def test_matches_on_a_line_tell_no_distortion():
+    grid = PatchGrid(2, 10, 12, np.zeros((120, 4), np.float32))
+    number = np.arange(5)
+    line = np.stack([16 * number, 32 * number], 1)
+    found = PatchMatches(2, number, number, np.ones(5, bool), line, line)
+    spread, distortion = spread_and_distortion(PlaceDescriptor(np.zeros(4, np.float32), (grid,)), [found])
+    assert spread == 0.0
+    assert distortion == np.inf

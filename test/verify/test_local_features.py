@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pnv_core.verify.local_features import XFeatVerifier, epipolar_check, thumbnail
+from pnv_core.verify.local_features import LocalFeatures, XFeatVerifier, epipolar_check, match, thumbnail
 
 VERIFIER = XFeatVerifier()
 
@@ -43,6 +43,31 @@ def test_two_views_of_one_scene_agree_and_their_points_are_where_the_views_put_t
 def test_other_scenes_agree_by_chance_only():
     for seed in range(5):
         assert epipolar_check(features(scene(seed)), features(scene(seed + 50)), 0.75).inliers <= 12
+
+
+@pytest.mark.parametrize("counts", [(40, 30), (2, 5), (60, 60)])
+def test_matches_are_mutual_and_distinct_by_definition(counts):
+    rng = np.random.default_rng(sum(counts))
+    shared = rng.normal(size=(max(counts), 8))
+    one, other = (
+        LocalFeatures(np.zeros((n, 2), np.float32), _unit(shared[:n] + 0.6 * rng.normal(size=(n, 8)))) for n in counts
+    )
+    similarity = one.descriptors @ other.descriptors.T
+    expected = []
+    for i, row in enumerate(similarity):
+        j = int(row.argmax())
+        if similarity[:, j].argmax() == i:
+            taken = similarity.copy()  # what is matched already is no second best
+            for a, b in enumerate(similarity.argmax(1)):
+                if similarity[:, b].argmax() == a:
+                    taken[a, b] = -1.0
+            second = max(taken[i].max(), taken[:, j].max())
+            expected.append((i, j, bool(1 - row[j] < 0.81 * (1 - second) and second < 0.965)))
+    assert list(zip(*(side.tolist() for side in match(one, other)), strict=True)) == expected
+
+
+def _unit(rows):
+    return (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
 
 
 def test_a_blank_picture_has_no_features_and_agrees_with_nothing():
