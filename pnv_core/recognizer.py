@@ -1,10 +1,10 @@
 """PlaceRecognizer: one frame in, its loop-closure candidates out. Deterministic, no clock, no ROS."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from pnv_core.config import live_settings
+from pnv_core.config import Config, live_settings
 from pnv_core.database import KeyframeDatabase
 from pnv_core.database.selection import KeyframeSelector
 from pnv_core.decide.consistency import DOUBT, SequenceMemory, window_of
@@ -13,10 +13,22 @@ from pnv_core.decide.judge import AROUND, Judge
 from pnv_core.decide.odometry import Odometry
 from pnv_core.describe.describer import Describer
 from pnv_core.errors import ConfigError
+from pnv_core.threads import workers
 from pnv_core.timing import StageTimer, TimeBudget
-from pnv_core.types import Frame, ImageRef, LoopClosure, Query
+from pnv_core.types import Frame, ImageRef, LoopClosure, PlaceDescriptor, Query
 
 _LATEST_NS = 2**62  # later than any stamp
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A new keyframe that was looked at and not looked up yet."""
+
+    frame: Frame
+    descriptor: PlaceDescriptor
+    predecessor: float  # cosine to the keyframe before it, 1 where there is none
+    config: Config  # at that time
+    began: float  # by the driver's clock
 
 
 class PlaceRecognizer:
@@ -39,6 +51,7 @@ class PlaceRecognizer:
         self.timer = timer or StageTimer()
         self.budget = TimeBudget(self.timer.clock)
         self.keyframes = KeyframeSelector(self.config)
+        self._workers = workers(self.config.threads)
         self.judge = Judge(describer.config, describer.model.info.calibration, self.database.steps)
         self.sequence = SequenceMemory(self.database.steps)
         self.latest: Query | None = None  # of the last frame processed; None where it was no keyframe
@@ -58,25 +71,40 @@ class PlaceRecognizer:
         Empty for a frame that is no keyframe or has no candidates. Raises ImageError for an unusable image.
         """
         self.latest = None
+        seen = self.look(frame)
+        return [] if seen is None else self.recognise(seen)
+
+    def look(self, frame: Frame) -> Seen | None:
+        """The first half of `process`: what a new keyframe shows; None for a frame that is none.
+
+        Shares nothing with `recognise`, so that another thread may be at the frame before meanwhile; each half takes
+        the frames in their order.
+        """
         if not self.keyframes.due(frame):
-            return []
-        self.budget.start()
+            return None
+        began = self.budget.now()
         with self.timer.stage("describe"):
-            descriptor = self.describer.describe(frame.rgb, frame.valid)
+            descriptor, kept = self._described(frame, self.keyframes.changing(frame))
         if not self.keyframes.differs(frame, descriptor):
-            return []
+            return None
         predecessor = self.keyframes.similarity(frame, descriptor)
         self.keyframes.take(frame, descriptor)
         if self.config.verify:
-            with self.timer.stage("features"):
-                kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
-                descriptor = replace(descriptor, thumbnail=kept, geometry=self.geometry_of(frame, kept))
+            with self.timer.stage("features"):  # those that are not done yet
+                descriptor = replace(descriptor, thumbnail=kept())
+        return Seen(frame, descriptor, predecessor, self.config, began)
+
+    def recognise(self, seen: Seen) -> list[LoopClosure]:
+        """The second half of `process`: the candidates of a keyframe, which is remembered."""
+        frame, descriptor, config = seen.frame, seen.descriptor, seen.config
+        if descriptor.thumbnail:
+            descriptor = replace(descriptor, geometry=self.geometry_of(frame, descriptor.thumbnail))
         with self.timer.stage("retrieve"):
-            recent_ns = int(self.config.exclude_recent_s * 1e9)
-            most = max(self.config.candidates, AROUND)
+            recent_ns = int(config.exclude_recent_s * 1e9)
+            most = max(config.candidates, AROUND)
             around = self.database.nearest(descriptor.global_vector, most, frame.stamp_ns, recent_ns)
-            candidates = around[: self.config.candidates]
-        limit = self.budget.affordable(len(candidates), self.config.time_budget_ms / 1e3)
+            candidates = around[: config.candidates]
+        limit = self.budget.affordable(len(candidates), config.time_budget_ms / 1e3, seen.began)
         with self.timer.stage("rerank"), self.budget.taken(limit):
             tried = candidates[:limit]
             stored = self.database.readable(ref.id for ref, _ in tried)
@@ -84,25 +112,33 @@ class PlaceRecognizer:
             candidates = [(ref, similarity) for ref, similarity in candidates if ref.id not in gone]
             known = list(stored.values())
             query = ImageRef(-1, frame.stamp_ns, frame.camera, self.database.session)
-            closures = self.judge.judge(query, descriptor, predecessor, candidates, known, self.config, around)
+            closures = self.judge.judge(query, descriptor, seen.predecessor, candidates, known, config, around)
         with self.timer.stage("store"):
             if not self.database.read_only:
                 query = self.database.add(frame.stamp_ns, frame.camera, descriptor)
             self.odometry.remember(query)
-        self.latest = Query(query, descriptor, predecessor)
+        self.latest = Query(query, descriptor, seen.predecessor)
         closures = [replace(c, query=query) for c in closures]
-        self.sequence.remember(frame.camera, closures, window_of(self.config.consistency + DOUBT))
-        return sorted(map(self._decided, closures), key=self.judge.order)
+        self.sequence.remember(frame.camera, closures, window_of(config.consistency + DOUBT))
+        return sorted((self._decided(c, config) for c in closures), key=self.judge.order)
+
+    def _described(self, frame: Frame, also_kept: bool) -> tuple[PlaceDescriptor, Callable[[], bytes]]:
+        """The descriptor, and what gives what the verifier keeps: made at the same time where that is wanted."""
+
+        def keep() -> bytes:
+            return self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
+
+        beside = self._workers.beside(keep) if self.config.verify and also_kept else keep
+        return self.describer.describe(frame.rgb, frame.valid), beside
 
     def look_up(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate for an image by itself, best first; nothing is remembered, no keyframe is too young.
 
         Without a sequence only `sure_score` accepts. Raises ImageError for an unusable image.
         """
-        descriptor = self.describer.describe(frame.rgb, frame.valid)
+        descriptor, kept = self._described(frame, True)
         if self.config.verify:
-            kept = self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
-            descriptor = replace(descriptor, thumbnail=kept)
+            descriptor = replace(descriptor, thumbnail=kept())
         around = self.database.nearest(descriptor.global_vector, max(self.config.candidates, AROUND), _LATEST_NS, 0)
         candidates = around[: self.config.candidates]
         stored = self.database.readable(ref.id for ref, _ in candidates)
@@ -136,7 +172,7 @@ class PlaceRecognizer:
         self.sequence.forget()
         self.odometry.forget()
 
-    def _decided(self, closure: LoopClosure) -> LoopClosure:
-        gate = self.config.odometry_drift, self.config.odometry_slack_m, self.config.min_travelled_m
+    def _decided(self, closure: LoopClosure, config: Config) -> LoopClosure:
+        gate = config.odometry_drift, config.odometry_slack_m, config.min_travelled_m
         impossible = self.odometry.impossible(closure.query, closure.match, *gate)
-        return decided(closure, self.config, self.sequence, impossible)
+        return decided(closure, config, self.sequence, impossible)

@@ -29,6 +29,10 @@ class Workers:
                 return [function(part) for part in parts]
             return list(self._pool.map(function, parts))
 
+    def beside(self, function: Callable[[], T]) -> Callable[[], T]:
+        """Starts the function in another thread, where there is one; what is given waits for its result."""
+        return function if self._pool is None else self._pool.submit(function).result
+
 
 @contextmanager
 def alone() -> Iterator[None]:

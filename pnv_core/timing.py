@@ -46,19 +46,17 @@ class TimeBudget:
 
     def __init__(self, clock: Callable[[], float] | None) -> None:
         self._clock = clock
-        self._started = 0.0
         self._each: deque[float] = deque(maxlen=_REMEMBERED)  # seconds per candidate
 
-    def start(self) -> None:
-        """The work on a frame begins."""
-        if self._clock is not None:
-            self._started = self._clock()
+    def now(self) -> float:
+        """When the work on a frame begins, for `affordable`."""
+        return 0.0 if self._clock is None else self._clock()
 
-    def affordable(self, candidates: int, budget_s: float) -> int:
-        """Of so many candidates, how many to re-rank; at least one, where there is one."""
+    def affordable(self, candidates: int, budget_s: float, began: float) -> int:
+        """Of so many candidates of a frame that `began` then, how many to re-rank; at least one, where there is one."""
         if self._clock is None or not budget_s or not self._each or not candidates:
             return candidates
-        left = budget_s - (self._clock() - self._started)
+        left = budget_s - (self._clock() - began)
         return max(1, min(candidates, int(left / float(np.percentile(self._each, _CAUTION)))))
 
     @contextmanager

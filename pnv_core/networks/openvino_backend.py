@@ -6,6 +6,7 @@ C channels, H x W pixels; one image at a time.
 import functools
 import hashlib
 import mmap
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -63,14 +64,16 @@ class Compiled:
                 _keep(kept, stamp, found.export_model().getvalue())
         self._request = found.create_infer_request()
         self._file = self._unread = file  # the library reads from it as long as it runs
+        self._turn = threading.Lock()
 
     def __call__(self, *inputs: NDArray) -> list[NDArray[np.float32]]:
-        """The outputs for contiguous inputs; arrays of the caller's own."""
-        self._request.infer(list(inputs), share_inputs=True)
-        if self._unread is not None:  # the weights are laid out anew now; pages that are asked for again come back
-            self._unread.madvise(mmap.MADV_DONTNEED)
-            self._unread = None
-        return [tensor.data.copy() for tensor in self._request.output_tensors]
+        """The outputs for contiguous inputs; arrays of the caller's own. Threads take turns."""
+        with self._turn:
+            self._request.infer(list(inputs), share_inputs=True)
+            if self._unread is not None:  # the weights are laid out anew now; pages that are asked for again come back
+                self._unread.madvise(mmap.MADV_DONTNEED)
+                self._unread = None
+            return [tensor.data.copy() for tensor in self._request.output_tensors]
 
 
 def _kept(path: Path, stamp: bytes, settings: dict[str, Any]) -> tuple[mmap.mmap | None, ov.CompiledModel | None]:
