@@ -32,8 +32,7 @@ from pnv_core.verify.verifier import Verifier
 from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
-CAUTION = 0.8  # what a false candidate counts in the fit: a fifth of it is a tower of floors that nobody tells apart
-_SURE_MOTION = 24  # SIFT features on one geometry, three times what chance gives
+CAUTION = 0.7  # what a false candidate counts in the fit: a fifth of it is a tower of floors that nobody tells apart
 
 
 class RememberedDescriber:
@@ -121,17 +120,24 @@ class Judged:
 def small_motion(query: NDArray[np.uint8], match: NDArray[np.uint8]) -> bool:
     """Whether two images show one place from a little farther on, whatever the ground truth and the verifier know.
 
-    24 SIFT features or more agree on one epipolar geometry, and the similarity transform between them magnifies by less
-    than two and rolls by less than 20 degrees.
+    At 320 pixels, 24 SIFT features or more agree on one epipolar geometry, or at 640 pixels 40, and the similarity
+    transform between them magnifies by less than two and rolls by less than 20 degrees. The most alike images of two
+    floors reach 28 at 640 pixels.
     """
-    one, other = (sift_record(image, (320, 320 * image.shape[0] // image.shape[1])) for image in (query, match))
+    return any(_moved_a_little(query, match, *sizes) for sizes in ((320, 1000, 24), (640, 4000, 40)))
+
+
+def _moved_a_little(query: NDArray[np.uint8], match: NDArray[np.uint8], width: int, most: int, least: int) -> bool:
+    """By at most `most` features of images `width` pixels wide, of which at least `least` agree."""
+    pair = query, match
+    one, other = (sift_record(image, (width, width * image.shape[0] // image.shape[1]), most) for image in pair)
     q, m = ratio_matches(one["descriptors"], other["descriptors"])
-    if len(q) < _SURE_MOTION:
+    if len(q) < least:
         return False
     points, seen = one["points"][q], other["points"][m]
-    _, mask = cv2.findFundamentalMat(points, seen, cv2.FM_RANSAC, 1.5, 0.99)
+    _, mask = cv2.findFundamentalMat(points, seen, cv2.FM_RANSAC, 1.5 * width / 320, 0.99)
     inlier = np.zeros(len(q), bool) if mask is None else mask.ravel() > 0
-    if inlier.sum() < _SURE_MOTION:
+    if inlier.sum() < least:
         return False
     transform, _ = cv2.estimateAffinePartial2D(seen[inlier], points[inlier])
     if transform is None:
@@ -172,6 +178,8 @@ def judged(
         if i in images.starts:
             recognizer.new_session()
         remembered.at = verifier.at = i
+        if images.positions is not None:
+            recognizer.odometry.add(frame.stamp_ns, *images.positions[i])
         before = recognizer.database.refs()
         closures = recognizer.process(frame)
         if (last := recognizer.database.last()) is not None and last.id not in image_of:

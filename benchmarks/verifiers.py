@@ -125,7 +125,7 @@ class Method:
             back = dict(zip(*ratio_matches(other.descriptors, one.descriptors), strict=True))
             mutual = np.array([back.get(j) == i for i, j in zip(q, r, strict=True)], bool)
             return q[mutual], r[mutual]
-        q, r, distinct = match(one, other)
+        q, r, distinct, _ = match(one, other)
         if self.matcher == "ratio":
             return q[distinct], r[distinct]
         sure = (one.descriptors[q] * other.descriptors[r]).sum(1) > (0.82 if self.matcher == "cosine" else -1)

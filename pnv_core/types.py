@@ -163,7 +163,8 @@ class Evidence:
     local_inliers: int = -1  # local features on one epipolar geometry; -1: not examined, -2: no picture to examine
     local_spread: float = 0.0  # of those
     local_matches: int = 0  # mutual nearest neighbours among the local features, whether they agree or not
-    likeness: float = 0.0  # of those: log of the distance between features of one image over that of matched ones
+    own_matches: int = 0  # of those: nearer than to any feature of the examined candidates elsewhere
+    likeness: float = 0.0  # of all: log of the distance between features of one image over that of matched ones
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
     background: float = 0.0  # similarity of the fifth most similar keyframe elsewhere; of a young map, the middle one
 

@@ -27,6 +27,7 @@ CHANCE = 8  # as many local features agree on some epipolar geometry by chance
 _LARGEST_DISTORTION = 2.0  # beyond it a map is as implausible as it gets
 _FEW_MATCHES = 40  # of fewer the share means little
 _FEW_INLIERS = 4
+_SURE_LEAD = 0.15  # of similarity
 
 
 def support(evidence: Evidence) -> float:
@@ -38,17 +39,19 @@ def support(evidence: Evidence) -> float:
     return math.log(agreeing) + 2.0 * math.log(max(evidence.spatial, 0.01) / 0.01)
 
 
-def agreement(evidence: Evidence) -> float:
+def accord(evidence: Evidence) -> float:
     """Log odds, but for a slope and a bias, that local features, patches and the rest of the map give a candidate.
 
     Inliers alone do not part look-alike corridors from a place by night. How near the matches are, measured by how near
-    features of one image are to each other, does, and how alike the map's other places look. Free weights, fitted on
-    some sets and judged on others, let corridors pass; these are round numbers that serve on the places choices are
-    made on.
+    features of one image are to each other, does, and how alike the map's other places look; what stands out from the
+    best of them is a place seen from elsewhere rather than one of many corridors, but up to a bound: of two doors in a
+    map of a few one stands out as well. Free weights, fitted on some sets and judged on others, let corridors pass;
+    these are round numbers that serve on the places choices are made on.
     """
     inliers, spatial = max(evidence.local_inliers, _FEW_INLIERS), max(evidence.spatial, 0.01)
     likeness = min(evidence.likeness, 0.0)  # the tiles of a wall are nearer to each other than to their own image
-    return math.log(inliers) + 0.5 * math.log(spatial) + 3.0 * likeness - 6.0 * evidence.background
+    elsewhere = 6.0 * max(0.0, min(evidence.lead, _SURE_LEAD)) - 5.0 * evidence.background
+    return math.log(inliers) + 0.5 * math.log(spatial) + 2.0 * likeness + elsewhere
 
 
 # Every feature grows with the belief in the candidate.
@@ -62,20 +65,10 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "recent_lead": lambda e: e.recent_lead,
         "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
     },
-    "verified": {"agreement": agreement},
+    "verified": {"accord": accord},
 }
-_OLDER: dict[str, dict[str, Callable[[Evidence], float]]] = {  # what older files name
-    "patches": {},
-    "verified": {
-        "support": support,
-        "spatial": lambda e: math.log(max(e.spatial, 1e-3)),
-        "regularity": lambda e: -min(e.distortion, _LARGEST_DISTORTION),
-        "local_inliers": lambda e: math.log(max(e.local_inliers, CHANCE) / CHANCE),
-        "local_spread": lambda e: e.local_spread,
-        "local_share": lambda e: max(e.local_inliers, 0) / (e.local_matches + CHANCE),
-    },
-}
-_VALUES = _FEATURES["patches"] | _FEATURES["verified"] | _OLDER["verified"]
+_VALUES = _FEATURES["patches"] | _FEATURES["verified"] | {"support": support}
+_FORMER = {"local_inliers", "local_spread", "local_share", "agreement"}  # what files of earlier releases may name
 
 
 # bounds of what a file may say
@@ -145,7 +138,9 @@ class Calibration:
         own = _evidence_settings(config)
         strides = self.patch_strides or (1,) * len(self.patch_sizes)
         fitted = replace(self, patch_strides=strides, patch_weights=self.patch_weights or own["patch_weights"])
-        return {name: getattr(fitted, name) for name, value in own.items() if getattr(fitted, name) != value}
+        found = {name: getattr(fitted, name) for name, value in own.items() if getattr(fitted, name) != value}
+        former = sorted({*self.patches.weights, *self.verified.weights} - set(_VALUES))
+        return found | ({"features": " and ".join(former) + " of an earlier release"} if former else {})
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -159,8 +154,8 @@ class Calibration:
             raise ModelError(f"calibration is incomplete or malformed ({error}); refit: pnv calibrate") from None
         for name, features in _FEATURES.items():
             model: Logistic = getattr(written, name)
-            known = set(features) | set(_OLDER[name])
-            if set(model.weights) - known or not np.isfinite([model.bias, *model.weights.values()]).all():
+            unknown = set(model.weights) - set(_VALUES) - _FORMER
+            if unknown or not np.isfinite([model.bias, *model.weights.values()]).all():
                 allowed = ", ".join(features)
                 raise ModelError(f"calibration.{name} = {given[name]}; allowed: weights >= 0 of {allowed}")
         return cls(**vars(written))

@@ -82,13 +82,16 @@ class Judge:
                 lambda pair: self.verifier.check(descriptor.thumbnail, query.camera, *pair), shown
             )
             places = [place for place, picture in enumerate(kept) if picture]
+            examined = [(found[place][0].match, check) for place, check in zip(places, checks, strict=True)]
             for place, check in zip(places, checks, strict=True):
                 closure, evidence, number = found[place]
+                rivals = [other for ref, other in examined if self._apart(ref, closure.match)]
                 seen = replace(
                     evidence,
                     local_inliers=check.inliers,
                     local_spread=check.spread,
                     local_matches=len(check.inlier),
+                    own_matches=check.matches_beside(rivals),
                     likeness=check.likeness,
                 )
                 verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)

@@ -25,6 +25,7 @@ _KEPT = 20_000  # latest samples, some minutes at 50 Hz
 _KEYFRAMES = 200_000  # about 20 MB
 _NEAR_NS = 500_000_000  # a position holds for images this close in time
 _STEP_BACK_NS = 1_000_000_000
+_LEVEL = 5.0  # how much surer height is than the way across: gravity tells what is level, and floors are 3 m apart
 
 
 class Refusal(StrEnum):
@@ -153,10 +154,13 @@ class Odometry:
     def impossible(self, query: ImageRef, match: ImageRef, drift: float, slack_m: float, least_way_m: float) -> bool:
         """Whether the robot cannot be back at `match`: too far from it for `drift` per metre gone, or it never left.
 
-        A place seen from `slack_m` away still counts as the same. Where a position is unknown nothing is impossible.
+        A place seen from `slack_m` away still counts as the same; of height a fifth of slack and drift is allowed, so
+        that the same spot of two floors is not one place. Where a position is unknown nothing is impossible.
         """
         here, there = (self._keyframes.get((ref.session, ref.id)) for ref in (query, match))
         if here is None or there is None:
             return False
         way = here.travelled_m - there.travelled_m
-        return way < least_way_m or math.dist(here.xyz, there.xyz) > slack_m + drift * way
+        (*across, up), (*across_there, up_there) = here.xyz, there.xyz
+        apart = max(math.dist(across, across_there), _LEVEL * abs(up - up_there))
+        return way < least_way_m or apart > slack_m + drift * way

@@ -22,7 +22,7 @@ from pnv_core.describe.download import cache_folder
 from pnv_core.threads import Workers
 from pnv_core.verify.feature_codes import features_only, pack, packed, picture_of, unpack
 from pnv_core.verify.matching import mutual_maxima, similarities
-from pnv_core.verify.verifier import EpipolarCheck, hull_area
+from pnv_core.verify.verifier import RATIO, EpipolarCheck, hull_area
 
 WIDTH = 640  # pixels of the longer side; night against day needs it
 MOST = 500  # features: 34 kB a keyframe
@@ -30,7 +30,6 @@ KEPT_BYTES = 68 * MOST + 8_000  # of a keyframe: features, and a small picture o
 _SMALL = 320  # pixels of the picture kept for people
 _TALLEST = 4 * _SMALL
 _QUALITY = 85
-_RATIO = 0.9  # Lowe 2004, section 7.1; plain mutual neighbours agree in look-alike corridors by the hundred
 _TWIN = 0.965  # cosine to a second feature from which on a look occurs twice: tiles of a wall
 _TOLERANCE_PX = 1.5
 _MOST_LIKE = 2.0
@@ -85,16 +84,21 @@ def decoded(picture: bytes) -> NDArray[np.uint8]:
 
 def match(
     query: LocalFeatures, reference: LocalFeatures
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Mutual nearest neighbours, as numbers (query, reference), and which of them are distinct (Lowe's ratio test)."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.float32]]:
+    """Mutual nearest neighbours, as numbers (query, reference), and which of them are distinct (Lowe's ratio test).
+
+    With the cosine (N,) of every feature of the query and its nearest one.
+    """
     if min(len(query.points), len(reference.points)) < 2:
-        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, bool)
+        return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, bool), np.zeros(len(query.points), np.float32)
     similarity = similarities(query.descriptors, reference.descriptors)
     best, mutual = mutual_maxima(similarity)
     first = similarity[mutual, best]
     similarity[mutual, best] = -1.0
-    second = np.maximum(similarity.max(1)[mutual], similarity.max(0)[best])
-    return mutual, best, (1.0 - first < _RATIO**2 * (1.0 - second)) & (second < _TWIN)
+    nearest = similarity.max(1)
+    second = np.maximum(nearest[mutual], similarity.max(0)[best])
+    nearest[mutual] = first
+    return mutual, best, (1.0 - first < RATIO**2 * (1.0 - second)) & (second < _TWIN), nearest
 
 
 def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float) -> EpipolarCheck:
@@ -103,12 +107,12 @@ def epipolar_check(query: LocalFeatures, reference: LocalFeatures, aspect: float
     Two images of one place in motion fulfil it whatever the depth of the scene; eight points fulfil it by chance.
     Found by USAC with graph-cut refinement (Raguram et al., TPAMI 2013; Barath and Matas, CVPR 2018).
     """
-    q, r, distinct = match(query, reference)
+    q, r, distinct, nearest = match(query, reference)
     a, b = query.points[q], reference.points[r]
     inlier = np.zeros(len(q), bool)
     inlier[distinct] = _epipolar_inliers(a[distinct] * WIDTH, b[distinct] * WIDTH)
     spread = min(hull_area(a[inlier]), hull_area(b[inlier])) / aspect
-    return EpipolarCheck(a, b, inlier, spread, _likeness(query, reference, q, r), distinct)
+    return EpipolarCheck(a, b, inlier, spread, _likeness(query, reference, q, r), distinct, q, nearest)
 
 
 def _likeness(query: LocalFeatures, reference: LocalFeatures, q: NDArray[np.int64], r: NDArray[np.int64]) -> float:

@@ -1,7 +1,7 @@
 """What examines a candidate beside its patches. A new one is a file here and a line in
 `VERIFIERS`, or `VERIFIERS.register` in a program."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,6 +13,8 @@ from pnv_core.errors import ConfigError
 from pnv_core.registry import Registry
 from pnv_core.threads import Workers
 
+RATIO = 0.9  # Lowe 2004, section 7.1; plain mutual neighbours agree in look-alike corridors by the hundred
+
 
 @dataclass(frozen=True, eq=False)
 class EpipolarCheck:
@@ -21,7 +23,8 @@ class EpipolarCheck:
     `spread` is the area of the inliers' convex hull as a share of the image, the smaller of both. `likeness` is the log
     of how far apart the most similar features of one image are over how far apart matched features are: high where
     matches are sure, low where the images repeat themselves. `distinct` (M,) are the matches that look like each other
-    alone; None where all do.
+    alone; None where all do. `numbers` (M,) are the matched features of the query, `nearest` (N,) is how similar each
+    of its N features is to the nearest of the reference; None where that is not known.
     """
 
     query: NDArray[np.float32]
@@ -30,14 +33,27 @@ class EpipolarCheck:
     spread: float
     likeness: float = 0.0
     distinct: NDArray[np.bool_] | None = None
+    numbers: NDArray[np.int64] | None = None
+    nearest: NDArray[np.float32] | None = None
 
     @property
     def inliers(self) -> int:
         return int(self.inlier.sum())
 
+    def matches_beside(self, rivals: Sequence["EpipolarCheck"]) -> int:
+        """How many features of the query are matched nearer, by Lowe's ratio, than any of the rivals has them.
+
+        `rivals` are the same query against other places; of none, every match counts.
+        """
+        others = [rival.nearest for rival in rivals if rival.nearest is not None]
+        if self.numbers is None or self.nearest is None or not others:
+            return len(self.inlier)
+        elsewhere = np.max([nearest[self.numbers] for nearest in others], axis=0)
+        return int((1.0 - self.nearest[self.numbers] < RATIO**2 * (1.0 - elsewhere)).sum())
+
     def swapped(self) -> "EpipolarCheck":
         """The same with query and reference exchanged."""
-        return replace(self, query=self.reference, reference=self.query)
+        return replace(self, query=self.reference, reference=self.query, numbers=None, nearest=None)
 
 
 class Verifier(Protocol):

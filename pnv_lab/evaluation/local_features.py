@@ -25,10 +25,10 @@ LIGHTGLUE_KINDS = {"lightglue": "LightGlue on ALIKED"}
 Pairs = tuple[NDArray[np.int64], NDArray[np.int64]]  # numbers of matched features in both images
 
 
-def sift_record(rgb: NDArray[np.uint8], size: tuple[int, int]) -> dict[str, NDArray]:
+def sift_record(rgb: NDArray[np.uint8], size: tuple[int, int], most: int = MAX_FEATURES) -> dict[str, NDArray]:
     """points (n, 2) float32 pixels and descriptors (n, 128) uint8 of the image resized to `size` (width, height)."""
     grey = cv2.cvtColor(resized(rgb, *size), cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT.create(MAX_FEATURES).detectAndCompute(grey, None)
+    keypoints, descriptors = cv2.SIFT.create(most).detectAndCompute(grey, None)
     points = np.array([k.pt for k in keypoints], np.float32).reshape(-1, 2)
     if descriptors is None:
         descriptors = np.empty((0, 128), np.float32)

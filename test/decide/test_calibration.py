@@ -38,11 +38,12 @@ def drawn(rng, n, examined=True):
     for _ in range(n):
         inliers, spatial = int(rng.integers(8, 60)), float(rng.uniform(0.02, 0.4))
         matches, likeness, background = int(rng.integers(inliers, 250)), rng.uniform(-1.5, 0), rng.uniform(0.1, 0.6)
-        agreeing, likely, rare = np.log(inliers * np.sqrt(spatial) / 9), 3 * (likeness + 0.7), 6 * (0.3 - background)
-        logit = 1.2 * (agreeing + likely + rare)
+        agreeing, likely, rare = np.log(inliers * np.sqrt(spatial) / 9), 2 * (likeness + 0.7), 5 * (0.3 - background)
+        lead = float(rng.uniform(-0.05, 0.15))
+        logit = 1.2 * (agreeing + likely + rare + 6 * max(lead, 0))
         e = Evidence(
             0.4, spatial, 50, 0.5, 0.2, local_inliers=inliers if examined else -1, local_matches=matches,
-            likeness=float(likeness), background=float(background),
+            likeness=float(likeness), background=float(background), lead=lead,
         )  # fmt: skip
         found.append((e, bool(rng.random() < 1 / (1 + np.exp(-logit))), 1 / (1 + np.exp(-logit))))
     return found
@@ -133,7 +134,7 @@ def test_the_calibration_lives_in_the_model_file_and_leaves_the_model_as_it_is(t
     save_model(small_model(), path)
     before = load_model(path)
     calibration = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"agreement": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"accord": 3.0}), "ransac", (2, 3), (320, 240), "a test",
         verifier="xfeat",
     )  # fmt: skip
     write_calibration(path, calibration)
@@ -156,6 +157,11 @@ def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
     older = {name: value for name, value in stored.items() if name != "verifier"}  # when there was RootSIFT alone
     older["verified"] = {"bias": -4.0, "weights": {"spatial": 1.0, "local_inliers": 3.0}}
     assert calibration_for(older, CONFIG) is CONSERVATIVE
+    former = stored | {"verified": {"bias": -4.0, "weights": {"agreement": 1.0}}}
+    assert calibration_for(former, CONFIG) is CONSERVATIVE
+    assert why_conservative(former, CONFIG) == (
+        "the model's calibration is for features = agreement of an earlier release: a conservative score decides"
+    )
 
 
 def test_a_calibration_holds_for_the_settings_that_shape_the_evidence_it_was_fitted_on():
@@ -190,7 +196,7 @@ def test_a_malformed_calibration_is_refused(change):
 
 def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilities_and_what_it_is_for_is_said():
     right = Calibration(
-        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"agreement": 3.0}), "ransac", (2, 3), (320, 240), "a test",
+        Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"accord": 3.0}), "ransac", (2, 3), (320, 240), "a test",
         verifier="xfeat",
     )  # fmt: skip
     evidence = [e for e, _, _ in drawn(np.random.default_rng(0), 20)]

@@ -144,22 +144,39 @@ def test_a_camera_in_front_of_the_robot_moves_when_the_robot_turns():
     assert odometry.at(S).of((0.5, 0.1, 0.2)) == pytest.approx((-0.1, 0.5, 0.2))
 
 
-def test_height_tells_the_floors_of_a_tower_apart_where_odometry_is_trusted_to_two_percent():
-    """Twelve metres of corridor and 3.5 m up by stairs of 8 m: the same spot on every floor."""
+def tower(storey):
+    """Odometry of twelve metres of corridor a floor and stairs of 8 s to the next; a keyframe at one spot of each."""
     odometry, floors = Odometry(), []
     for floor in range(6):
         for step in range(20):
             stair = max(step - 12, 0) / 8
             second = 20 * floor + step
             x = float(step) if step <= 12 else 12.0 * (1 - stair)
-            odometry.add(second * S, x, 0.0, 3.5 * (floor + stair))
+            odometry.add(second * S, x, 0.0, storey * (floor + stair))
             ref = ImageRef(second, second * S, "front")
             odometry.remember(ref)
             if step == 6:
                 floors.append(ref)
+    return odometry, floors
+
+
+def test_height_tells_the_floors_of_a_tower_apart_and_nothing_does_where_odometry_is_flat():
+    (high, floors), (flat, _) = tower(3.5), tower(0.0)
     pairs = [(later, earlier) for i, later in enumerate(floors) for earlier in floors[:i]]
-    trusted = {"drift": 0.02, "slack_m": 2.0, "least_way_m": 1.0}
-    assert all(odometry.impossible(*pair, **trusted) for pair in pairs)
     default = Config()
     gate = default.odometry_drift, default.odometry_slack_m, default.min_travelled_m
-    assert not any(odometry.impossible(*pair, *gate) for pair in pairs)
+    assert all(high.impossible(*pair, *gate) for pair in pairs)
+    assert not any(flat.impossible(*pair, *gate) for pair in pairs)
+
+
+def test_a_place_seen_from_a_little_higher_or_after_a_long_way_that_height_drifted_on_is_possible():
+    default = Config()
+    gate = default.odometry_drift, default.odometry_slack_m, default.min_travelled_m
+    for way, up, impossible in ((100, 1.9, False), (100, 5.0, True), (400, 5.0, False)):
+        odometry, refs = Odometry(), []
+        for second in range(way + 1):
+            out = min(second, way - second)
+            odometry.add(second * S, float(out), 0.0, up * second / way)
+            refs.append(ImageRef(second, second * S, "front"))
+            odometry.remember(refs[-1])
+        assert odometry.impossible(refs[-1], refs[0], *gate) is impossible

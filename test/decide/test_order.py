@@ -44,11 +44,10 @@ def test_of_equal_candidates_the_older_comes_first():
     assert ranked([closure(5, 0.5, 0.1), closure(2, 0.5, 0.1)], Config.make()) == [2, 5]
 
 
-@pytest.mark.parametrize("name", ["similarity", "spatial", "local_inliers"])
+@pytest.mark.parametrize("name", ["similarity", "spatial", "local_inliers", "own_matches"])
 @given(st.floats(0, 1), st.floats(0, 1), st.integers(-1, 200), st.floats(0, 1))
 def test_more_of_any_evidence_never_moves_a_candidate_back(name, similarity, spatial, inliers, more):
     evidence = Evidence(similarity, spatial, 10, local_inliers=inliers)
-    raised = replace(
-        evidence, **{name: getattr(evidence, name) + (round(100 * more) if name == "local_inliers" else more)}
-    )
+    step = round(100 * more) if name in ("local_inliers", "own_matches") else more
+    raised = replace(evidence, **{name: getattr(evidence, name) + step})
     assert standing(raised) >= standing(evidence)
