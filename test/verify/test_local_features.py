@@ -63,7 +63,25 @@ def test_matches_are_mutual_and_distinct_by_definition(counts):
                     taken[a, b] = -1.0
             second = max(taken[i].max(), taken[:, j].max())
             expected.append((i, j, bool(1 - row[j] < 0.81 * (1 - second) and second < 0.965)))
-    assert list(zip(*(side.tolist() for side in match(one, other)), strict=True)) == expected
+    *matches, nearest = match(one, other)
+    assert list(zip(*(side.tolist() for side in matches), strict=True)) == expected
+    assert nearest == pytest.approx(similarity.max(1), abs=1e-5)
+
+
+def test_matches_beside_rivals_are_those_that_no_other_place_has_as_near():
+    rng = np.random.default_rng(5)
+    rows = _unit(rng.normal(size=(40, 16)))
+
+    def seen(numbers, noise):
+        changed = _unit(rows[numbers] + noise * rng.normal(size=(len(numbers), 16)))
+        return LocalFeatures(rng.uniform(size=(len(numbers), 2)).astype(np.float32), changed)
+
+    query = LocalFeatures(rng.uniform(size=(40, 2)).astype(np.float32), rows)
+    here = epipolar_check(query, seen(np.arange(40), 0.02), 0.75)
+    rival = epipolar_check(query, seen(np.arange(25, 40), 0.01), 0.75)  # has fifteen of them, and nearer
+    assert here.matches_beside([]) == 40
+    assert here.matches_beside([rival]) == 25
+    assert rival.matches_beside([here]) <= 15
 
 
 def _unit(rows):
