@@ -3,7 +3,8 @@
     python -m benchmarks.precision --data ../shared/data --train ../shared/train [--quick]
 
 Recall@1 by the global vector, by patches and re-ranked on the sets of benchmarks.recall_table, with queries and
-references in one precision, and with queries in another one than the map. int8: convolutions quantised by NNCF on
+references in one precision, and with queries in another one than the map. bfloat16 leaves the trunk's first layers and
+what follows the trunk in float32, as the product does. int8: convolutions quantised by NNCF on
 training photographs. Times are those of the trunk in turns on one image; ONNX Runtime has no bfloat16 convolutions.
 Needs nncf, onnx and onnxruntime, which the product does not: pip install 'pnv_ros[benchmarks]'
 """
@@ -90,7 +91,7 @@ def times(describer: Describer, images: list[NDArray[np.uint8]], threads: int, r
         "torch eager": lambda: eager(batch),
         "onnxruntime float32": in_onnxruntime(describer, threads),
         "openvino float32": partial(Compiled(partial(trunk_maps, model, size), threads), pixels),
-        "openvino bfloat16": partial(Compiled(partial(trunk_maps, model, size), threads, "bfloat16"), pixels),
+        "openvino bfloat16": partial(Compiled(partial(trunk_maps, model, size, True), threads), pixels),
         "openvino int8": partial(Compiled(lambda: graph, threads), pixels),
     }
     with torch.inference_mode():

@@ -112,12 +112,14 @@ def _torch() -> Finding:
 
 def _openvino() -> Finding:
     try:
+        from pnv_core.describe.describer import precision_of, read_model
+        from pnv_core.describe.download import resolve_weights
         from pnv_core.networks.openvino_backend import fast_precisions, release
     except (ImportError, OSError) as error:
         advice = "pip install openvino, or set backend: torch"
         return Finding("openvino", FAULT, str(error), advice)
     fast = [_PRECISIONS[name] for name in fast_precisions() if name in _PRECISIONS]
-    used = Config().trunk_precision
+    used = precision_of(Config(), read_model(resolve_weights("default")))
     return Finding("openvino", OK, f"{release()}; fast here: {', '.join(fast)}; the network computes in {used}")
 
 

@@ -51,9 +51,10 @@ class Config:
         choices=("auto", "openvino", "torch"),
     )
     trunk_precision: str = setting(
-        "float32",
-        "arithmetic of the describing network; bfloat16 is faster where the processor has it",
-        choices=("float32", "bfloat16"),
+        "auto",
+        "arithmetic of the describing network after its first layers; auto: bfloat16 for the default model in OpenVINO "
+        "where the processor multiplies it natively, else float32",
+        choices=("auto", "float32", "bfloat16"),
     )
     threads: int = setting(2, "threads of the network and of matching; 0 = all cores", low=0, high=256)
     image_width: int = setting(

@@ -86,6 +86,17 @@ def backend_of(config: Config) -> str:
     return config.backend
 
 
+def precision_of(config: Config, model: Model) -> str:
+    """'float32' or 'bfloat16', as the Config asks for."""
+    if config.trunk_precision != "auto":
+        return config.trunk_precision
+    if not model.trunk.precise or backend_of(config) != "openvino":
+        return "float32"
+    from pnv_core.networks.openvino_backend import fast_precisions
+
+    return "bfloat16" if "BF16" in fast_precisions() else "float32"
+
+
 def _describing(model: Model, config: Config) -> Describing:
     windows = list(zip(config.patch_sizes, config.patch_strides, strict=True))
     if backend_of(config) == "torch":
@@ -99,7 +110,7 @@ def _describing(model: Model, config: Config) -> Describing:
 
 
 class Describer:
-    """Patch-NetVLAD descriptors of one image at a time. `config` has every size filled in from the model."""
+    """Patch-NetVLAD descriptors of one image at a time. `config` has the sizes and the precision filled in."""
 
     def __init__(self, model: Model, config: Config | None = None) -> None:
         self.config = _completed(config or Config(), model)
@@ -190,7 +201,7 @@ def _valid_cells(valid: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np
 
 
 def _completed(config: Config, model: Model) -> Config:
-    """Config with the model's own sizes where it leaves them open."""
+    """Config with the model's own sizes and this processor's precision where it leaves them open."""
     info = model.info
     width, height = config.image_width or info.image_width, config.image_height or info.image_height
     sizes = config.patch_sizes or info.patch_sizes
@@ -203,6 +214,7 @@ def _completed(config: Config, model: Model) -> Config:
         patch_sizes=sizes,
         patch_strides=config.patch_strides or (1,) * len(sizes),
         patch_weights=weights,
+        trunk_precision=precision_of(config, model),
     )
     cell = model.trunk.stride
     cells = min(width, height) // cell

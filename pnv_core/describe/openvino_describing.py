@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from openvino import opset15 as ops
 
 from pnv_core.describe.model_files import Model
+from pnv_core.networks.layers import Scale
 from pnv_core.networks.openvino_backend import Compiled, Node, build, constant, image_input, integers
 
 Floats = NDArray[np.float32]
@@ -25,6 +26,7 @@ Windows = Sequence[tuple[int, int]]  # (size, stride) per patch size
 _COLUMNS = 16  # of the projection at a time: with K clusters their maps then fit the second-level cache
 _SEPARATE = 4  # sizes from here on are summed one axis at a time
 _EPSILON = 1e-12  # as F.normalize
+_GRAPH = "1"  # to be counted up where the graph changes: what older programs compiled is no longer read
 
 
 class OpenVinoDescribing:
@@ -33,24 +35,25 @@ class OpenVinoDescribing:
     def __init__(
         self, model: Model, size: tuple[int, int], windows: Windows, threads: int, precision: str, cache: Path | None
     ) -> None:
-        """`precision` is that of the network; `cache` a folder for what is compiled."""
+        """`precision` is that of the trunk but for its precise layers; `cache` a folder for what is compiled."""
         self._model, self._size, self._cache, self._dense = model, size, cache, model.trunk.dense
-        self._settings = threads, precision
+        self._threads, self._half = threads, precision == "bfloat16"
         cells = model.trunk.shape(*size)[1:]
         self._every = np.ones((1, 1, *cells), np.float32)
         shaping = size, tuple(map(tuple, windows))
         if self._dense is None:
-            self._graph = self._compiled(partial(describing, model, size, windows), "describing", *shaping)
+            self._graph = self._compiled(partial(describing, model, size, windows, self._half), "describing", *shaping)
         else:
             self._graph = self._compiled(partial(head, model, cells, windows), "head", *shaping)
 
     def _compiled(self, graph: Callable[[], ov.Model], *shaping: object) -> Compiled:
-        name = hashlib.sha256(f"{self._model.fingerprint()} {shaping}".encode()).hexdigest()[:32]
-        return Compiled(graph, *self._settings, None if self._cache is None else self._cache / name)
+        told = f"{_GRAPH} {self._model.fingerprint()} {shaping} {self._half}"
+        name = hashlib.sha256(told.encode()).hexdigest()[:32]
+        return Compiled(graph, self._threads, kept=None if self._cache is None else self._cache / name)
 
     @cached_property
     def _trunk(self) -> Compiled:
-        return self._compiled(partial(trunk_maps, self._model, self._size), "maps", self._size)
+        return self._compiled(partial(trunk_maps, self._model, self._size, self._half), "maps", self._size)
 
     def maps(self, pixels: NDArray[np.uint8]) -> tuple[Floats, ...]:
         """The trunk's maps: features (C, h, w), before the neck (W, h, w), and deep ones (E, h', w')."""
@@ -70,11 +73,15 @@ class OpenVinoDescribing:
         return vector, patches
 
 
-def describing(model: Model, size: tuple[int, int], windows: Windows) -> ov.Model:
-    """(1, H, W, 3) uint8 and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ..."""
-    pixels, features, wide, deep = _maps(model, size)
+def describing(model: Model, size: tuple[int, int], windows: Windows, half: bool = False) -> ov.Model:
+    """(1, H, W, 3) uint8 and (1, 1, h, w), how much each cell counts -> the vector (D,), patches (n, D), ...
+
+    With `half` the trunk computes in bfloat16 after its precise layers, and local descriptors are projected in it.
+    """
+    pixels, features, wide, deep = _maps(model, size, half)
     counted = ops.parameter([1, 1, *model.trunk.shape(*size)[1:]], np.float32)
-    return ov.Model(_described(model, features, wide, deep, counted, windows), [pixels, counted], "describing")
+    outputs = _described(model, features, wide, deep, counted, windows, half)
+    return ov.Model(outputs, [pixels, counted], "describing")
 
 
 def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
@@ -84,25 +91,32 @@ def head(model: Model, cells: tuple[int, int], windows: Windows) -> ov.Model:
     features = ops.parameter([1, model.trunk.channels, *cells], np.float32)
     deep = ops.parameter([1, *model.trunk.pooled_shape(cells)], np.float32)
     counted = ops.parameter([1, 1, *cells], np.float32)
-    return ov.Model(_described(model, features, features, deep, counted, windows), [features, deep, counted], "head")
+    outputs = _described(model, features, features, deep, counted, windows, False)
+    return ov.Model(outputs, [features, deep, counted], "head")
 
 
-def trunk_maps(model: Model, size: tuple[int, int]) -> ov.Model:
+def trunk_maps(model: Model, size: tuple[int, int], half: bool = False) -> ov.Model:
     """(1, H, W, 3) uint8 -> the trunk's features, the map before its neck and the deep one, each once."""
-    pixels, features, wide, deep = _maps(model, size)
+    pixels, features, wide, deep = _maps(model, size, half)
     outputs = [features] * bool(model.trunk.neck) + [wide] + [deep] * bool(model.trunk.deep)
     return ov.Model(outputs, [pixels], "trunk")
 
 
-def _maps(model: Model, size: tuple[int, int]) -> tuple[Node, Node, Node, Node]:
+def _maps(model: Model, size: tuple[int, int], half: bool) -> tuple[Node, Node, Node, Node]:
     """The graph's input; the trunk's features, the map before its neck and the deep one."""
     trunk, weights = model.trunk, model.part("trunk")
-    pixels, images = image_input(*size)
-    wide = build(trunk.layers, weights, images)
-    return pixels, build(trunk.neck, weights, wide), wide, build(trunk.deep, weights, wide)
+    scale = next((layer for layer in trunk.layers[: trunk.input_layers] if isinstance(layer, Scale)), None)
+    pixels, images = image_input(*size, scale)
+    first = max(trunk.precise, trunk.input_layers)
+    x = build(tuple(layer for layer in trunk.layers[:first] if layer is not scale), weights, images)
+    wide = build(trunk.layers[first:], weights, ops.convert(x, "bf16") if half else x)
+    found = build(trunk.neck, weights, wide), wide, build(trunk.deep, weights, wide)
+    return pixels, *(ops.convert(maps, "f32") for maps in found)
 
 
-def _described(model: Model, features: Node, wide: Node, deep: Node, counted: Node, windows: Windows) -> list[Node]:
+def _described(
+    model: Model, features: Node, wide: Node, deep: Node, counted: Node, windows: Windows, half: bool
+) -> list[Node]:
     """What follows the trunk."""
     centroids = model.tensors["netvlad.centroids"]
     _, c, h, w = features.output(0).shape
@@ -111,7 +125,7 @@ def _described(model: Model, features: Node, wide: Node, deep: Node, counted: No
     weights = ops.multiply(ops.softmax(logits, 0), ops.reshape(counted, integers(1, h * w), False))
     vector = _global_vector(model, x, weights, {"pooled_projection": deep, "middle_projection": wide}, counted)
     scales = _scales(centroids, x, weights, (h, w), windows)
-    return [vector, *_patches(model, x, weights, scales, (h, w), windows)]
+    return [vector, *_patches(model, ops.convert(x, "bf16") if half else x, weights, scales, (h, w), windows)]
 
 
 def _unit(x: Node, axis: int) -> Node:
@@ -195,8 +209,8 @@ def _patches(
     for start in range(0, len(bias), _COLUMNS):
         block = weight[start : start + _COLUMNS].reshape(-1, k, c).transpose(1, 0, 2)  # (K, d, C)
         offsets = np.einsum("kdc,kc->kd", block, centroids)[:, :, None, None]
-        projected = ops.matmul(constant(block.reshape(-1, c)), x, False, False)
-        maps = ops.reshape(projected, integers(k, -1, h, w), False)
+        projected = ops.matmul(constant(block.reshape(-1, c), x.get_element_type()), x, False, False)
+        maps = ops.reshape(ops.convert(projected, "f32"), integers(k, -1, h, w), False)
         residuals = ops.multiply(ops.subtract(maps, constant(offsets)), assigned)
         for found, scale, window in zip(parts, scales, windows, strict=True):
             scaled = ops.multiply(_window_means(residuals, *window), scale)

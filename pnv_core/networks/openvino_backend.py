@@ -1,6 +1,7 @@
 """Networks in OpenVINO: graphs built from layers and numpy weights, compiled for this processor, kept on disk.
 
-C channels, H x W pixels; one image at a time.
+C channels, H x W pixels; one image at a time. A graph computes in the types of its nodes: layers that are given
+bfloat16 run in it, with weights rounded here.
 """
 
 import functools
@@ -40,6 +41,7 @@ Node = Any  # what an operation gives
 Weights = Mapping[str, NDArray[np.float32]]
 _DIGEST = hashlib.sha256().digest_size
 PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
+_BEYOND = 1e30  # larger than anything a network gives
 
 
 class Compiled:
@@ -48,8 +50,11 @@ class Compiled:
     def __init__(
         self, graph: Callable[[], ov.Model], threads: int, precision: str = "float32", kept: Path | None = None
     ) -> None:
-        """`graph` makes it; `threads` 0 = all cores. `kept` is a file for what was compiled: its name must tell apart
-        whatever shapes the graph. With other settings, another release of the library or damage it is made again."""
+        """`graph` makes it; where its types are wider it computes in `precision`. `threads` 0 = all cores.
+
+        `kept` is a file for what was compiled: its name must tell apart whatever shapes the graph. With other settings,
+        another release of the library or damage it is made again.
+        """
         settings: dict[str, Any] = {
             "PERFORMANCE_HINT": "LATENCY",
             "INFERENCE_PRECISION_HINT": PRECISIONS[precision],
@@ -113,10 +118,14 @@ def fast_precisions() -> list[str]:
     return list(ov.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
 
 
-def image_input(width: int, height: int) -> tuple[Node, Node]:
-    """(1, H, W, 3) uint8 parameter, and the same as (1, 3, H, W) float32 in [0, 1]."""
+def image_input(width: int, height: int, scale: Scale | None = None) -> tuple[Node, Node]:
+    """(1, H, W, 3) uint8 parameter, and the same as (1, 3, H, W) float32 in [0, 1], scaled where given.
+
+    The library computes with channels last: scaled before the transposition, nothing is moved.
+    """
     pixels = ops.parameter([1, height, width, 3], np.uint8)
-    scaled = ops.multiply(ops.convert(pixels, "f32"), constant(1 / 255))
+    mean, std = (np.asarray(v, np.float64) for v in ((scale.mean, scale.std) if scale else (0.0, 1.0)))
+    scaled = ops.subtract(ops.multiply(ops.convert(pixels, "f32"), constant(1 / (255 * std))), constant(mean / std))
     return pixels, ops.transpose(scaled, integers(0, 3, 1, 2))
 
 
@@ -166,17 +175,50 @@ def _convolution(conv: Conv, weights: Weights, x: Node) -> Node:
     if conv.groups > 1:
         kernel = kernel.reshape(conv.groups, -1, *kernel.shape[1:])
     convolve = ops.group_convolution if conv.groups > 1 else ops.convolution
-    y = convolve(x, constant(kernel), strides, [top, left], [bottom, right], [1, 1])
-    return ops.add(y, _per_channel(weights[f"{conv.name}.bias"])) if conv.bias else y
+    kind = x.get_element_type()
+    half = kind == ov.Type.bf16
+    if half and conv.groups > 1:
+        kernel = _rounded_with_sums(kernel)
+    y = convolve(x, constant(kernel, kind), strides, [top, left], [bottom, right], [1, 1])
+    if not conv.bias:
+        return y
+    bias = np.reshape(weights[f"{conv.name}.bias"], (1, -1, 1, 1))
+    if half:  # in two parts, or its error is the same in every cell; sums are float32 until they are kept
+        y = ops.clamp(ops.add(y, constant(bias, kind)), -_BEYOND, _BEYOND)  # else the library adds the parts beforehand
+        bias = bias - _rounded(bias)
+    return ops.add(y, constant(bias, kind))
+
+
+def _rounded(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """To the nearest bfloat16, ties to even; the library's conversion of constants cuts off."""
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    return ((bits + 0x7FFF + (bits >> 16 & 1)) & 0xFFFF0000).view(np.float32)
+
+
+def _rounded_with_sums(kernels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(C, ...) to bfloat16 such that the sum of each stays.
+
+    Kernels that respond to contrast sum to nearly nothing; rounded one by one they would respond to brightness as well.
+    From the largest weight to the smallest each takes over the error of those before it.
+    """
+    flat = kernels.reshape(len(kernels), -1)
+    order = np.argsort(-np.abs(flat), axis=1, kind="stable")
+    rounded, error = np.empty_like(flat), np.zeros((len(flat), 1), np.float32)
+    for taps in order.T[:, :, None]:
+        wanted = np.take_along_axis(flat, taps, 1) + error
+        np.put_along_axis(rounded, taps, _rounded(wanted), 1)
+        error = wanted - _rounded(wanted)
+    return rounded.reshape(kernels.shape)
 
 
 def _per_channel(values: Sequence[float] | NDArray[np.float32]) -> Node:
     return constant(np.asarray(values, np.float32).reshape(1, -1, 1, 1))
 
 
-def constant(values: Any) -> Node:
-    """A float32 constant of the shape of the values."""
-    return ops.constant(np.ascontiguousarray(values, np.float32))
+def constant(values: Any, kind: ov.Type = ov.Type.f32) -> Node:
+    """A constant of the shape of the values, float32 or bfloat16."""
+    found = np.ascontiguousarray(values, np.float32)
+    return ops.constant(found) if kind == ov.Type.f32 else ops.convert(ops.constant(_rounded(found)), kind)
 
 
 def integers(*values: int) -> Node:

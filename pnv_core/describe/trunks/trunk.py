@@ -29,6 +29,7 @@ class Trunk:
     dense: Dense | None = None
     dense_channels: int = 0
     stride: int = 16  # pixels per feature cell
+    precise: int = 0  # of the first layers, those that stay in float32 where the others compute in bfloat16
 
     @property
     def width(self) -> int:
