@@ -202,7 +202,9 @@ class PlaceRecognizerNode(LifecycleNode):
         self._stamps = StampRule(config.on_stamp_back)
         poses = RelativePoses(recognizer)
         outputs = Outputs(self, config, describer.image_size, poses)
-        self._recognition = Recognition(recognizer, views, outputs, self._statistics, self._stamps, self.get_logger())
+        self._recognition = Recognition(
+            recognizer, views, outputs, self._statistics, self._stamps, self.get_logger(), self._failed
+        )
         self._diagnostics = Diagnostics(self, self._recognition, self._statistics)
         poses.mounts = dict(zip(config.image_topics, _mounts(config.camera_in_base), strict=False))
         self._companions = Companions(self, config, views, poses, recognizer.odometry, outputs.markers.placing)
@@ -291,6 +293,9 @@ class PlaceRecognizerNode(LifecycleNode):
         if self._worker is not None:
             self._worker.stop()
             self._worker = None
+        if self._recognition is not None:
+            with self._recognition.still():
+                pass  # the frame in hand is finished
 
     def _report_autosave(self, done: SaveReport | MapError) -> None:
         self._statistics.autosave_failure = str(done) if isinstance(done, MapError) else ""
@@ -307,6 +312,7 @@ class PlaceRecognizerNode(LifecycleNode):
 
     def _free(self) -> None:
         if self._recognition is not None:
+            self._recognition.close()
             if self._recognition.fleet is not None:
                 self._recognition.fleet.close()
             self._recognition.outputs.close()

@@ -2,7 +2,9 @@
 
 import threading
 import time
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +13,7 @@ from rclpy.serialization import deserialize_message
 from msg_adapters.images import message_to_frame
 from pnv_core.config import live_settings
 from pnv_core.errors import ImageError, PnvError
-from pnv_core.recognizer import PlaceRecognizer
+from pnv_core.recognizer import PlaceRecognizer, Seen
 from pnv_core.types import Frame, LoopClosure
 from pnv_fleet.fleet import Fleet
 from pnv_ros.depths import Depths
@@ -28,7 +30,11 @@ _TELL_S = 5.0  # between two lines about closed loops
 
 
 class Recognition:
-    """Recogniser, views and outputs of a configured node. Between two frames, services may hold it `still`."""
+    """Recogniser, views and outputs of a configured node. Between two frames, services may hold it `still`.
+
+    What a frame shows is looked up and published in a second thread, while the first is at the next frame: each half of
+    the recogniser has the frames in their order. With one thread for everything there is no second one.
+    """
 
     def __init__(
         self,
@@ -38,7 +44,9 @@ class Recognition:
         statistics: Statistics,
         stamps: StampRule,
         log: Any,
+        failed: Callable[[BaseException], None],
     ) -> None:
+        """A failure of the second thread is handed to `failed`."""
         self.recognizer, self.views, self.outputs = recognizer, views, outputs
         self._statistics, self._stamps, self._log = statistics, stamps, log
         self.fleet: Fleet | None = None
@@ -47,14 +55,25 @@ class Recognition:
         self._session = 0
         self._wanted: Settings | None = None  # None: as configured
         self._taken: Settings | None = None
-        self._still = threading.Lock()
+        self._shown: Settings | None = None  # what the second thread has taken
+        self._failed = failed
+        self._looking, self._finishing = threading.Lock(), threading.Lock()
+        alone = recognizer.config.threads == 1
+        self._second = None if alone else ThreadPoolExecutor(1, thread_name_prefix="recognition")
         self._sizes: dict[str, tuple[int, int]] = {}
         self._complained: dict[str, float] = {}
         self._told, self._untold = -_TELL_S, 0
 
-    def still(self) -> AbstractContextManager[Any]:
-        """No frame is processed while this is held."""
-        return self._still
+    @contextmanager
+    def still(self) -> Iterator[None]:
+        """No frame is processed while this is held; those begun are finished."""
+        with self._looking, self._finishing:
+            yield
+
+    def close(self) -> None:
+        """Finish the frame in hand."""
+        if self._second is not None:
+            self._second.shutdown()
 
     def change(self, settings: Settings) -> None:
         """New live settings, all at once, from the next frame on. Never waits."""
@@ -62,7 +81,7 @@ class Recognition:
 
     def reset(self) -> int:
         """Forget every keyframe and stamp; how many keyframes there were."""
-        with self._still:
+        with self.still():
             count = len(self.recognizer.database)
             self.recognizer.reset()
             self._stamps.forget()
@@ -101,28 +120,23 @@ class Recognition:
         if view.needs_info and view.rectifier is None:
             raise PnvError(f"{camera} has no camera info yet; allowed: once it came")
         frame = view(message_to_frame(image, camera))
-        with self._still:
+        with self.still():
             return self.recognizer.look_up(frame)
 
     def work(self, waiting: WaitingFrame) -> None:
-        """Process a frame and publish what was found. An unusable frame is skipped with a throttled warning."""
-        with self._still:
+        """Look at a frame; what it shows is finished later. An unusable one is skipped with a throttled warning."""
+        with self._looking:
             wanted = self._wanted
             if wanted is not None and wanted is not self._taken:
                 self._taken = wanted
                 self.recognizer.change(**live_settings(wanted.recogniser))
-                self.outputs.config = wanted.node
-                if self.fleet is not None:
-                    self.fleet.change(self.recognizer.config)
             if waiting.session < self._session:  # waited here while another camera began a new session
                 self._statistics.drop(waiting.camera, Drop.STAMP_BACK)
                 return
             if waiting.session > self._session:
                 self._session = waiting.session
-                self.recognizer.new_session()
-                self.outputs.new_session()
-                if self.localisation is not None:
-                    self.localisation.forget()
+                with self._finishing:
+                    self._new_session()
             view = self.views[waiting.camera]
             if view.needs_info and view.rectifier is None:
                 self._statistics.drop(waiting.camera, Drop.NO_CAMERA_INFO)
@@ -130,21 +144,52 @@ class Recognition:
                 return
             try:
                 frame = self._unpacked(waiting)
-                closures = self.recognizer.process(frame)
+                seen = self.recognizer.look(frame)
             except ImageError as error:
                 self._stamps.unusable(waiting.camera, waiting.stamp_ns)
                 count = self._statistics.drop(waiting.camera, Drop.UNUSABLE)
                 self._complain(waiting.camera, f"{waiting.camera}: {error} ({count} frames skipped so far)")
                 return
-            self._share()
-            if closures:
-                with self.recognizer.timer.stage("publish"):
-                    self.outputs.publish(frame, closures, self._picture_of)
-            if self.localisation is not None and self.recognizer.latest is not None:
-                with self.recognizer.timer.stage("localise"):
-                    self.localisation.look(frame.stamp_ns, closures)
+            if seen is None:
+                self._statistics.process(waiting.camera, None, 0, "")
+            elif self._second is None:
+                self._finish(seen, self._taken)
+            else:
+                self._finishing.acquire()
+                self._second.submit(self._finish_and_release, seen, self._taken)
+
+    def _new_session(self) -> None:
+        self.recognizer.new_session()
+        self.outputs.new_session()
+        if self.localisation is not None:
+            self.localisation.forget()
+
+    def _finish_and_release(self, seen: Seen, settings: Settings | None) -> None:
+        try:
+            self._finish(seen, settings)
+        except BaseException as failure:
+            self._failed(failure)
+        finally:
+            self._finishing.release()
+
+    def _finish(self, seen: Seen, settings: Settings | None) -> None:
+        """Look up what a frame shows, and publish what was found."""
+        if settings is not None and settings is not self._shown:
+            self._shown = settings
+            self.outputs.config = settings.node
+            if self.fleet is not None:
+                self.fleet.change(seen.config)
+        frame = seen.frame
+        closures = self.recognizer.recognise(seen)
+        self._share()
+        if closures:
+            with self.recognizer.timer.stage("publish"):
+                self.outputs.publish(frame, closures, self._picture_of)
+        if self.localisation is not None:
+            with self.recognizer.timer.stage("localise"):
+                self.localisation.look(frame.stamp_ns, closures)
         accepted = sum(c.accepted for c in closures)
-        self._statistics.process(waiting.camera, closures[0].score if closures else None, accepted, _in_words(closures))
+        self._statistics.process(frame.camera, closures[0].score if closures else None, accepted, _in_words(closures))
         self._tell(closures, accepted)
 
     def _share(self) -> None:

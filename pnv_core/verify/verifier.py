@@ -62,7 +62,10 @@ class Verifier(Protocol):
     side: int  # pixels it looks at along the longer side of an image; more tell it nothing
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
-        """(H, W, 3) uint8, optionally (H, W) bool of the pixels to use -> what is kept of the image."""
+        """(H, W, 3) uint8, optionally (H, W) bool of the pixels to use -> what is kept of the image.
+
+        Another thread may be comparing other images meanwhile.
+        """
         ...
 
     def prepare(self, kept: Iterable[tuple[bytes, str]], workers: Workers) -> None:

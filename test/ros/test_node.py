@@ -224,10 +224,11 @@ def test_odometry_rules_out_a_closure_and_places_the_keyframes(domain, listener)
         assert node.end() == 0
 
 
-def test_a_worker_that_fails_ends_the_process_with_its_traceback(domain, listener):
+@pytest.mark.parametrize("half", ["look", "recognise"])
+def test_a_worker_that_fails_ends_the_process_with_its_traceback(domain, listener, half):
     broken = (
         "import sys; from pnv_core.recognizer import PlaceRecognizer; "
-        "PlaceRecognizer.process = lambda *_: 1 / 0; "
+        f"PlaceRecognizer.{half} = lambda *_: 1 / 0; "
         "from pnv_ros.place_recognizer import main; sys.exit(main())"
     )
     node = Process(sys.executable, "-c", broken, *ros_arguments(**EAGER))
