@@ -26,8 +26,9 @@ from pnv_fleet.places import (
     row_bytes,
     without_picture,
 )
-from pnv_fleet.store import Access, PlaceStore
+from pnv_fleet.store import Access, PlaceStore, check_uri
 
+_LANES = ("ask", "send")  # who speaks to the store
 _MOST_OFFERED = 64  # keyframes in memory that the outbox has not taken yet
 _BATCH, _BATCH_BYTES = 16, 2_000_000
 _LONGEST_PAUSE_S = 30.0  # between tries of a store that fails
@@ -116,7 +117,7 @@ class Fleet:
     ask    the fleet is asked for each, in order; what has waited longer than the budget is left to send
     send   places go to the store in batches; queries that were not answered in time are asked first
 
-    Raises FleetError for an outbox that cannot be used.
+    Raises FleetError for an address, a name or an outbox that cannot be used.
     """
 
     def __init__(
@@ -130,11 +131,12 @@ class Fleet:
         say: Callable[[str], None],
     ) -> None:
         self.options = options
+        check_uri(options.uri)
         self._robot = robot_name(options.robot)
         self._access = Access.from_environment()
         self._fingerprint, self._config = fingerprint, config
         self._like, self._parts = like, parts_of(layouts_of(like))
-        self._lanes = tuple(Answers(config, calibration, like) for _ in ("ask", "send"))
+        self._lanes = {lane: Answers(config, calibration, like) for lane in _LANES}
         self._closures, self._say = closures, say
         self._outbox = Outbox(options.outbox, options.outbox_mb)
         self._store: PlaceStore | None = None
@@ -145,8 +147,9 @@ class Fleet:
         self._changed = threading.Condition()
         self._connecting = threading.Lock()
         self._ended = threading.Event()
-        self._troubles: dict[str, tuple[str, float]] = {}  # of "outbox" and "store": what, since when
-        self._pause_s = self._again = 0.0
+        self._troubles: dict[str, tuple[str, float]] = {}  # of the outbox and the lanes: what, since when
+        self._pause_s, self._again = dict.fromkeys(_LANES, 0.0), dict.fromkeys(_LANES, 0.0)
+        self._opened = ""
         self._counts: Counter[str] = Counter()
         self._robots: Counter[str] = Counter()
         self._owed = 0.0  # bytes beyond the limit
@@ -188,7 +191,7 @@ class Fleet:
         with self._changed:
             troubles, counts, robots = dict(self._troubles), Counter(self._counts), dict(self._robots)
         return FleetStatus(
-            problem="; ".join(text for text, _ in troubles.values()),
+            problem="; ".join(dict.fromkeys(text for text, _ in troubles.values())),
             since=min((since for _, since in troubles.values()), default=0.0),
             waiting=len(self._outbox),
             dropped=counts["lost"] + self._outbox.dropped,
@@ -264,21 +267,22 @@ class Fleet:
                     return
                 asked = self._fresh.popleft()
             try:
-                if (time.monotonic() - asked.offered) * 1e3 <= self.options.budget_ms:
-                    self._answer(self._lanes[0], asked)
-                else:
-                    self._lanes[0].forget()  # left to `send`: what follows it does not follow what was asked before it
+                in_time = (time.monotonic() - asked.offered) * 1e3 <= self.options.budget_ms
+                if in_time and self._owed <= 0:
+                    self._answer("ask", asked)
+                else:  # left to `send`: what follows it does not follow what was asked before it
+                    self._lanes["ask"].forget()
             except FleetError as error:
-                self._fail(str(error))
+                self._fail("ask", str(error))
             finally:
                 with self._changed:
                     if asked.place is not None:
                         self._pending.discard(asked.place.key)
                     self._changed.notify_all()
 
-    def _answer(self, answers: Answers, asked: _Asked) -> bool:
+    def _answer(self, lane: str, asked: _Asked) -> bool:
         """Ask and hand the answer on; False where the store is not to be tried yet. Raises FleetError."""
-        store = self._connected()
+        store, answers = self._connected(lane), self._lanes[lane]
         if store is None:
             return False
         answers.config = self._config
@@ -288,9 +292,9 @@ class Fleet:
         late = (time.monotonic() - asked.offered) * 1e3 > self.options.budget_ms
         more, refused = answers.received - before, len(answers.refused)
         self._tally(asked=1, late=late, closures=len(accepted), refused=refused, bytes_received=more)
+        self._owe(more)
+        self._well("ask")
         self._robots.update(c.match.robot for c in accepted)
-        self._owed += more
-        self._well("store")
         for told in answers.refused:
             self._say(f"refused {told}")
         answers.refused.clear()
@@ -312,7 +316,7 @@ class Fleet:
                 busy = self._send_some()
                 self._expire()
             except FleetError as error:
-                self._fail(str(error))
+                self._fail("send", str(error))
                 busy = False
             if not busy:
                 with self._changed:
@@ -327,21 +331,21 @@ class Fleet:
         batch = self._outbox.oldest(_BATCH, limit, pending)
         if not batch:
             return False
-        store = self._connected()
-        if store is None:
+        store = self._connected("send")
+        kept = self._answered(batch) if store is not None else None
+        if store is None or kept is None:
             return False
-        kept = self._answered(batch)
         if kept:
             store.put([w.place for w in kept])
             self._outbox.remove([w.number for w in kept])
             count = sum(row_bytes(w.place) for w in kept)
             self._tally(sent=len(kept), bytes_sent=count)
-            self._owed += count
-            self._well("store")
+            self._owe(count)
+        self._well("send")
         return True
 
-    def _answered(self, batch: list[Waiting]) -> list[Waiting]:
-        """Those to send, once the fleet was asked what it was not asked in time."""
+    def _answered(self, batch: list[Waiting]) -> list[Waiting] | None:
+        """Those to send, once the fleet was asked what it was not asked in time; None where it cannot be."""
         late = [w for w in batch if not w.asked]
         for w in late:
             with self._changed:
@@ -358,8 +362,9 @@ class Fleet:
                 continue
             query = Query(place.ref, seen, w.predecessor)
             asked = _Asked(query, place, self._where(place.stamp_ns, place.session), -math.inf)
-            if self._ended.is_set() or not self._answer(self._lanes[1], asked):
-                return []
+            self._repay()
+            if self._ended.is_set() or not self._answer("send", asked):
+                return None
         if not late:
             return batch
         with self._changed:
@@ -371,7 +376,7 @@ class Fleet:
         """Now and then, forget this robot's places of long ago. Age is counted in its own stamps, as in a replay."""
         if not self.options.keep_days or not self._newest_ns or time.monotonic() < self._expiry_due:
             return
-        store = self._connected()
+        store = self._connected("send")
         if store is None:
             return
         oldest_ns = self._newest_ns - int(self.options.keep_days * 86_400e9)
@@ -382,20 +387,23 @@ class Fleet:
             self._say(f"fleet: forgot {count} places older than {self.options.keep_days:g} days")
 
     def _repay(self) -> None:
-        """Wait until the limit allows to send again."""
-        if not self.options.kb_s:
-            self._owed = 0.0
+        """Wait until the limit allows to send and to ask again."""
         while self._owed > 0 and not self._ended.is_set():
             wait = min(0.5, self._owed / (self.options.kb_s * 1e3))
             self._ended.wait(wait)
-            self._owed -= wait * self.options.kb_s * 1e3
+            self._owe(-wait * self.options.kb_s * 1e3)
+
+    def _owe(self, count: float) -> None:
+        """Bytes beyond the limit, from either lane."""
+        with self._changed:
+            self._owed += count if self.options.kb_s else 0.0
 
     # The store's state
 
-    def _connected(self) -> PlaceStore | None:
-        """The store; None while it is left alone after a failure. Raises FleetError where it cannot be opened."""
+    def _connected(self, lane: str) -> PlaceStore | None:
+        """The store; None while the lane leaves it alone after a failure. Raises FleetError."""
         with self._connecting:
-            if time.monotonic() < self._again:
+            if time.monotonic() < self._again[lane]:
                 return None
             if self._store is None:
                 timeout_s = max(_TIMEOUT_S, 4e-3 * self.options.budget_ms)
@@ -407,18 +415,20 @@ class Fleet:
                     self._parts,
                     timeout_s,
                 )
-                self._say(f"fleet: {self.options.uri} ({store.version()}), collection {store.collection}")
+                told = f"fleet: {self.options.uri} ({store.version()}), collection {store.collection}"
                 if store.others:
-                    self._say(f"fleet: the store also holds {len(store.others)} other models, which cannot be compared")
-                self._store = store
+                    told += f"; {len(store.others)} other models, which cannot be compared"
+                if told != self._opened:
+                    self._say(told)
+                self._store, self._opened = store, told
             return self._store
 
-    def _fail(self, problem: str) -> None:
-        """The store failed: it is left alone for a while, longer each time."""
-        self._trouble("store", problem)
+    def _fail(self, lane: str, problem: str) -> None:
+        """The store failed a lane, which leaves it alone for a while, longer each time; a full one still answers."""
+        self._trouble(lane, problem)
         with self._connecting:
-            self._pause_s = min(_LONGEST_PAUSE_S, max(1.0, 2 * self._pause_s))
-            self._again = time.monotonic() + self._pause_s
+            self._pause_s[lane] = min(_LONGEST_PAUSE_S, max(1.0, 2 * self._pause_s[lane]))
+            self._again[lane] = time.monotonic() + self._pause_s[lane]
             if self._store is not None:
                 with suppress(FleetError):
                     self._store.close()
@@ -428,18 +438,19 @@ class Fleet:
         if self._ended.is_set():  # the outbox was closed under a thread that was left behind
             return
         with self._changed:
-            before, since = self._troubles.get(part, ("", time.time()))
+            _, since = self._troubles.get(part, ("", time.time()))
+            known = problem in (text for text, _ in self._troubles.values())
             self._troubles[part] = problem, since
-        if problem != before:
+        if not known:
             self._say(f"fleet: {problem}")
 
     def _well(self, part: str) -> None:
         with self._changed:
             trouble = self._troubles.pop(part, None)
-        if part == "store":
-            self._pause_s = self._again = 0.0
+        if part in _LANES:
+            self._pause_s[part] = self._again[part] = 0.0
         if trouble is not None:
-            self._say(f"fleet: the {part} is well again, after {time.time() - trouble[1]:.0f} s")
+            self._say(f"fleet: well again after {time.time() - trouble[1]:.0f} s: {trouble[0]}")
 
     def _tally(self, **more: int) -> None:
         with self._changed:
@@ -452,7 +463,7 @@ class Fleet:
             try:
                 run()
             except Exception as error:  # a defect: local recognition goes on, and it is said
-                self._fail(f"ended by {type(error).__name__}: {error}")
+                self._trouble(run.__name__, f"ended by {type(error).__name__}: {error}")
                 raise
 
         return guarded

@@ -102,6 +102,8 @@ def _reason(error: Exception) -> str:
         return "the store cannot be reached"
     if "no space left" in low or "disk full" in low or "disk quota" in low:
         return f"the store has no room ({text})"
+    if "open local milvus failed" in low:
+        return "Milvus Lite cannot open it; allowed: its own intact folder, which no other process holds"
     return text or type(error).__name__
 
 
@@ -257,17 +259,23 @@ class PlaceStore:
         return [*META, "vector", *(f"view_{part}" for part in range(self.parts))]
 
 
+def check_uri(uri: str) -> None:
+    """Raises FleetError for what is no address of a store, or holds a password."""
+    if "@" in uri:
+        raise FleetError("fleet_uri holds a user or password; allowed: the environment variable PNV_FLEET_TOKEN")
+    if not uri.startswith(("http://", "https://")) and not uri.endswith(".db"):
+        raise FleetError(f"fleet_uri = {uri!r}; allowed: http://HOST:PORT, https://HOST:PORT or a file NAME.db")
+
+
 def connect(uri: str, access: Access, timeout_s: float) -> Any:
     """A client of its own connection. Raises FleetError."""
+    check_uri(uri)
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # read when grpc is imported: its own lines say no more than ours
     try:
         from pymilvus import MilvusClient
     except ImportError:
         raise FleetError("fleet_uri needs pymilvus; allowed: after `pip install pnv_ros[fleet]`") from None
     remote = uri.startswith(("http://", "https://"))
-    if "@" in uri:
-        raise FleetError("fleet_uri holds a user or password; allowed: the environment variable PNV_FLEET_TOKEN")
-    if not remote and not uri.endswith(".db"):
-        raise FleetError(f"fleet_uri = {uri!r}; allowed: http://HOST:PORT, https://HOST:PORT or a file NAME.db")
     for name in ("pymilvus", "milvus_lite"):
         logging.getLogger(name).setLevel(logging.CRITICAL)  # each failure is told once, in one line, by FleetError
     more: dict[str, Any] = {"dedicated": True} if remote else {}

@@ -1,5 +1,8 @@
 """`pnv fleet` on a served store: a map goes up and a selection comes down as the same map."""
 
+import subprocess
+import sys
+
 import numpy as np
 
 from pnv_cli.main import main
@@ -18,6 +21,7 @@ SECOND = 10**9
 def test_a_map_goes_up_is_queried_comes_down_and_is_forgotten(server, tmp_path, capsys):
     import cv2
 
+    places_of(server, ())  # none
     describer = load_describer("default", min_interval_s=0.0, min_change=0.0)
     robot = PlaceRecognizer(describer)
     for number in range(6):
@@ -104,6 +108,13 @@ def test_numbers_that_select_nothing_sensible_are_one_line(server, capsys):
         assert "allowed" in line, line
     assert main(["fleet", "status", "--uri", server.uri]) == 0
     assert ", 3 places" in capsys.readouterr().out
+
+
+def test_a_store_that_speaks_no_tls_is_one_line(server):
+    command = [sys.executable, "-m", "pnv_cli.main", "fleet", "status", "--uri", server.uri.replace("http:", "https:")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == f"pnv: {command[-1]}: the store cannot be reached\n"
 
 
 def test_no_store_and_a_store_that_is_not_there_are_one_line(tmp_path, capsys):

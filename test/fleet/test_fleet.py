@@ -127,6 +127,41 @@ def test_a_store_that_is_away_loses_nothing_and_its_answers_come_late(server, tm
     back.fleet.close()
 
 
+def test_a_store_that_answers_but_has_no_room_is_one_line(server, tmp_path, monkeypatch):
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(1, 2, 3)
+    alpha.settled()
+    full = True
+    put = PlaceStore.put
+
+    def refuse(store, places):
+        if full:
+            raise FleetError(f"{store.uri}: the store has no room")
+        put(store, places)
+
+    monkeypatch.setattr(PlaceStore, "put", refuse)
+    alpha.lines.clear()
+    for number in range(10, 14):
+        alpha.see(number)
+        wait_until(lambda n=number: alpha.status.asked + alpha.status.late >= n - 6, 30, "an answer")
+        wait_until(lambda: "no room" in alpha.status.sentence(), 30, "a problem")
+        time.sleep(0.5)
+    assert alpha.lines == [f"fleet: {server.uri}: the store has no room"]
+    full = False
+    alpha.settled()
+    wait_until(lambda: not alpha.status.problem, 30, "an end of it")
+    assert alpha.lines[1].startswith("fleet: well again after")
+    assert len(alpha.lines) == 2
+    alpha.fleet.close()
+
+
+@pytest.mark.parametrize("uri", ["http://robot:secret@127.0.0.1:1", "places.sqlite"])
+def test_an_address_that_is_none_is_refused_at_once(tmp_path, uri):
+    with pytest.raises(FleetError, match="allowed") as refusal:
+        Robot(tmp_path, "alpha", uri)
+    assert "secret" not in str(refusal.value)
+
+
 def test_the_recogniser_never_waits_for_a_store_that_never_answers(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as silent:
         robot = Robot(tmp_path, "alpha", f"http://127.0.0.1:{silent.getsockname()[1]}")
@@ -199,6 +234,26 @@ def test_no_more_is_sent_than_the_limit_allows(server, tmp_path):
     took, one = time.monotonic() - start, robot.status.bytes_sent / 12
     assert robot.status.bytes_sent <= 100e3 * took + 16 * one  # the first batch is not waited for
     robot.fleet.close()
+
+
+def test_what_is_received_keeps_to_the_limit_as_well(server, tmp_path):
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(*range(24))
+    alpha.settled()
+    one = alpha.status.bytes_sent / 24
+    beta = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=5000, kb_s=one / 500)  # two a second
+    start, most = time.monotonic(), 0.0
+    beta.see(*range(100, 106))
+    while beta.status.waiting and time.monotonic() - start < 60:
+        status = beta.status
+        most = max(most, status.bytes_sent + status.bytes_received - 2 * one * (time.monotonic() - start))
+        time.sleep(0.01)
+    beta.settled()
+    assert beta.status.asked == 6
+    assert beta.status.bytes_received > 15 * one
+    assert most <= (beta.describer.config.candidates + 3) * one * 1.1  # of one query and of a batch
+    for robot in (alpha, beta):
+        robot.fleet.close()
 
 
 def test_a_query_that_is_no_keyframe_is_asked_and_not_stored(server, tmp_path):

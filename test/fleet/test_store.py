@@ -260,6 +260,14 @@ def test_access_comes_from_the_environment_and_files(tmp_path, monkeypatch):
         Access.from_environment()
 
 
+def test_a_file_that_is_no_store_is_said_in_one_line(tmp_path):
+    pytest.importorskip("milvus_lite", reason="the extra `fleet` is not installed")
+    (tmp_path / "places.db").write_text("rubbish")
+    with pytest.raises(FleetError, match="cannot open it; allowed"):
+        PlaceStore(str(tmp_path / "places.db"), "2" * 64, Access(), DIM, PARTS)
+    assert (tmp_path / "places.db").read_text() == "rubbish"
+
+
 def test_a_truncated_store_file_is_said_in_one_line(tmp_path):
     pytest.importorskip("milvus_lite", reason="the extra `fleet` is not installed")
     from milvus_lite.server_manager import server_manager_instance
