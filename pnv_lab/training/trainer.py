@@ -39,7 +39,7 @@ class TrainOptions:
     vlad_lr: float = 1e-3
     projection_lr: float = 1e-3
     weight_decay: float = 1e-4
-    frozen_layers: int = 16  # leading layers of the trunk that keep their ImageNet weights
+    frozen_layers: int = 16  # leading layers of the trunk that keep their ImageNet weights, at most all but its last
     patch_weight: float = 0.5  # of the patches' loss
     patch_pairs: int = 10  # image pairs of a batch that the patches' loss looks at
     patch_sizes: tuple[int, ...] = (2, 3, 4, 5)  # one drawn per step
@@ -74,6 +74,7 @@ class Trainer:
         self.model, self.batches, self.validation = model, batches, validation
         self.options = options
         self.device = torch.device(device)
+        self.frozen_layers = min(options.frozen_layers, model.trunk.depth - 1)
         if options.loss not in LOSSES:
             raise ModelError(f"loss {options.loss!r} is none; allowed: {', '.join(LOSSES)}")
         if model.patch_projection is None or model.pooled_projection is None:
@@ -127,7 +128,7 @@ class Trainer:
     def _freeze(self) -> None:
         for parameter in self.parts.parameters():
             parameter.requires_grad_(True)
-        for parameter in self.model.trunk.front_parameters(self.options.frozen_layers):
+        for parameter in self.model.trunk.front_parameters(self.frozen_layers):
             parameter.requires_grad_(False)
 
     def _groups(self) -> list[dict[str, Any]]:
@@ -193,7 +194,7 @@ class Trainer:
                 found = self.model.trunk.maps((inputs.float() / 255).contiguous(memory_format=torch.channels_last))
             else:
                 maps = inputs.float().contiguous(memory_format=torch.channels_last)
-                found = self.model.trunk.back(maps, self.options.frozen_layers)
+                found = self.model.trunk.back(maps, self.frozen_layers)
         return [maps.float() for maps in found]
 
     def _patch_loss(self, batch: Batch, x: Tensor, weights: Tensor, shape: tuple[int, int]) -> Tensor:
