@@ -1,6 +1,10 @@
 """The default network's arithmetic: what it costs in recall and in time, and the same trunk in other libraries.
 
     python -m benchmarks.precision --data ../shared/data --train ../shared/train [--quick]
+    python -m benchmarks.precision --data ../shared/data --train ../shared/train --first viewpoint tower --draws 4
+
+`--first`: how often the recogniser has a true place first, in float32 and in bfloat16, on sets of benchmarks.closures.
+Draw 0 is the images as they are; in each other one every pixel has up to a grey level of noise, the same in both.
 
 Recall@1 by the global vector, by patches and re-ranked on the sets of benchmarks.recall_table, with queries and
 references in one precision, and with queries in another one than the map. bfloat16 leaves the trunk's first layers and
@@ -12,6 +16,8 @@ Needs nncf, onnx and onnxruntime, which the product does not: pip install 'pnv_r
 import argparse
 import io
 import random
+import tempfile
+import zlib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -22,12 +28,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.closure_sets import FALSE, TRUE, sequence
+from benchmarks.closures import judged
 from benchmarks.recall_table import described, opened, orders
 from benchmarks.run import compared
 from pnv_core import Describer, load_describer
 from pnv_core.describe.openvino_describing import describing, trunk_maps
 from pnv_core.describe.torch_model import TorchTrunk
 from pnv_core.networks.openvino_backend import Compiled
+from pnv_core.types import LoopClosure, PlaceDescriptor
 from pnv_lab.fit import image_files, read_rgb
 
 _DEPTH = 10
@@ -115,6 +124,40 @@ def recalls(describers: dict[str, Describer], args: argparse.Namespace) -> None:
                 print(row + f"{right[0]:8}{right[1]:9}{right[2]:11}", flush=True)
 
 
+class Noisy:
+    """A describer of images with up to a grey level of noise, another for each draw; none for draw 0."""
+
+    def __init__(self, describer: Describer, draw: int) -> None:
+        self.config, self.model = describer.config, describer.model
+        self.cell, self.grids = describer.cell, describer.grids
+        self.fingerprint = f"{draw}_{describer.config.trunk_precision[0]}_{describer.fingerprint}"  # a cache of its own
+        self._describer, self._draw = describer, draw
+
+    def describe(self, rgb: NDArray[np.uint8], valid: NDArray[np.bool_] | None = None) -> PlaceDescriptor:
+        if self._draw:
+            noise = np.random.default_rng((self._draw, zlib.crc32(rgb.tobytes()))).integers(-1, 2, rgb.shape)
+            rgb = np.clip(rgb + noise, 0, 255).astype(np.uint8)
+        return self._describer.describe(rgb, valid)
+
+
+def first_places(describers: dict[str, Describer], args: argparse.Namespace) -> None:
+    """Queries with a revisit whose first candidate, of those with a known truth, is true."""
+    print(f"{'set':12}{'queries':>8}  first place per draw")
+    for name in args.first:
+        images, rows = sequence(name, args.data.parent), {}
+        for precision, describer in describers.items():
+            found = [judged(images, Noisy(describer, draw), args.cache) for draw in range(args.draws)]  # type: ignore[arg-type]
+            rows[precision] = np.array([[_first(q) for q in f.queries] for f in found])[:, found[0].loops]
+        (a, b), queries = rows.values(), rows["float32"].shape[1]
+        for precision, right in rows.items():
+            print(f"{name:12}{queries:8}  {precision:10}{right.sum(1)}, mean {right.sum(1).mean():.1f}")
+        print(f"{'':20}  lost {(a & ~b).sum(1)}, won {(b & ~a).sum(1)}", flush=True)
+
+
+def _first(query: list[tuple[LoopClosure, int]]) -> bool:
+    return next((label == TRUE for _, label in query if label in (TRUE, FALSE)), False)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True)
@@ -125,8 +168,14 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rounds", type=int, default=30)
     parser.add_argument("--quick", action="store_true", help="times only")
+    parser.add_argument("--first", nargs="+", default=[], metavar="SET", help="first places on these sets only")
+    parser.add_argument("--draws", type=int, default=1)
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "pnv_closures")
     args = parser.parse_args()
     describers = {p: load_describer(trunk_precision=p, threads=args.threads) for p in ("float32", "bfloat16")}
+    if args.first:
+        first_places(describers, args)
+        return
     images = photographs(describers["float32"], args.train, 300)
     times(describers["float32"], images, args.threads, args.rounds)
     if not args.quick:

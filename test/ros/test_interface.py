@@ -41,7 +41,7 @@ def test_the_interface_page_names_every_topic_and_service_of_the_node(idle, list
 
 
 def test_the_start_up_block_says_what_runs(idle):
-    for words in ("model        default (", "network      openvino, float32, ",
+    for words in ("model        default (", "network      openvino, ",
                   "preset       default: ", "MB per keyframe",
                   "listens to   /camera/image_raw (Image, best effort, volatile)",
                   "publishes    /loop_closures"):  # fmt: skip
