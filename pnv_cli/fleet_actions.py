@@ -90,7 +90,7 @@ def _push(args: argparse.Namespace) -> int:
 
 def _pull(args: argparse.Namespace) -> int:
     store, describer, like = _opened(args)
-    manifest = maps.pull(store, _where(args), args.output, describer.map_fingerprint, like)
+    manifest = maps.pull(store, _where(args), args.output, describer.map_fingerprint, like, print)
     print(f"{args.output}: {manifest.keyframes} keyframes in {len(manifest.sessions)} sessions")
     return 0
 

@@ -1,6 +1,6 @@
 """Saved maps and the fleet: a map goes up, a selection comes down, the store is looked through and thinned."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -51,19 +51,28 @@ def _place(kf: SavedKeyframe, robot: str, session: int, like: PlaceDescriptor, p
     return Place(robot, session, kf.ref.camera, kf.ref.id, kf.ref.stamp_ns, kf.texture, seen.global_vector, view)
 
 
-def pull(store: PlaceStore, where: str, output: Path, fingerprint: str, like: PlaceDescriptor) -> Manifest:
+def pull(
+    store: PlaceStore, where: str, output: Path, fingerprint: str, like: PlaceDescriptor, say: Callable[[str], None]
+) -> Manifest:
     """The places that fulfil an expression as a map that a node loads; each robot's sessions are sessions of it.
 
-    Raises FleetError for none, too many or a row that is not believed, MapError for an output that exists.
+    A row that is not believed is left out and told to `say`. Raises FleetError for none or too many, MapError for an
+    output that exists.
     """
     count = store.count(where)
     if not 0 < count <= MOST:
         raise FleetError(f"{count} places are selected; allowed: 1 to {MOST}")
     places: list[Place] = []
     for place in store.scan(where, views=True):
-        if isinstance(place, str):
-            raise FleetError(f"{place}; allowed: after `pnv fleet verify` and `forget`")
-        places.append(place)
+        try:
+            if isinstance(place, str):
+                raise FleetError(place)
+            decode_view(place.view, layouts_of(like))
+            places.append(place)
+        except FleetError as error:
+            say(f"refused {error}")
+    if not places:
+        raise FleetError(f"none of {count} places is whole; allowed: one at least")
     places.sort(key=lambda p: (p.session, p.robot, p.keyframe))
     keyframes = list(_keyframes(places, like))
     none = Manifest(fingerprint, store.dim, 0, 0, 0, 0, (), (), ())

@@ -1,5 +1,6 @@
 """`pnv fleet` on a served store: a map goes up and a selection comes down as the same map."""
 
+import base64
 import subprocess
 import sys
 
@@ -11,7 +12,7 @@ from pnv_core.describe.describer import load_describer
 from pnv_core.maps import MapStore
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame
-from pnv_fleet.places import Place, encode_view, layouts_of, parts_of
+from pnv_fleet.places import Place, encode_view, layouts_of, parts_of, to_row
 from pnv_fleet.store import Access, PlaceStore
 from test.ros.camera import scene
 
@@ -108,6 +109,23 @@ def test_numbers_that_select_nothing_sensible_are_one_line(server, capsys):
         assert "allowed" in line, line
     assert main(["fleet", "status", "--uri", server.uri]) == 0
     assert ", 3 places" in capsys.readouterr().out
+
+
+def test_rows_that_are_not_believed_do_not_stop_a_map_from_coming_down(server, tmp_path, capsys):
+    store = places_of(server, ("alpha",))
+    row = to_row(next(p for p in store.scan(views=True) if not isinstance(p, str)), store.parts)
+    lie = base64.b64encode(b"PNVV" + bytes(30_000)).decode()
+    store._client.upsert(store.collection, [row | {"key": "a" * 32, "robot": "no\nname"}])
+    store._client.upsert(store.collection, [row | {"key": "b" * 32, "robot": "liar", "view_0": lie}])
+    assert main(["fleet", "pull", "-o", str(tmp_path / "down.map"), "--uri", server.uri]) == 0
+    *refused, last = capsys.readouterr().out.splitlines()
+    assert last.endswith("3 keyframes in 1 sessions")
+    assert len(refused) == 2
+    assert all(line.startswith("refused ") for line in refused)
+    assert main(["fleet", "pull", "--robot", "liar", "-o", str(tmp_path / "none.map"), "--uri", server.uri]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "allowed" in line
+    places_of(server, ())
 
 
 def test_a_store_that_speaks_no_tls_is_one_line(server):
