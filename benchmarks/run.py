@@ -264,8 +264,9 @@ def describing_row(size: tuple[int, int], threads: int, rounds: int) -> dict[str
     sides = {}
     for backend, precision in (("torch", "float32"), ("openvino", "float32"), ("openvino", "bfloat16")):
         describer = load_describer(
-            image_width=size[0], image_height=size[1], threads=threads, backend=backend, trunk_precision=precision
-        )
+            image_width=size[0], image_height=size[1], threads=threads, backend=backend, trunk_precision=precision,
+            verify=0,
+        )  # fmt: skip
         sides[f"{backend} {precision}"] = partial(describer.describe, rgb)
     row = compared(f"describe() at {size[0]}x{size[1]}", sides, rounds)
     return row | {"gflop": describing_gflop(describer.model, size)}

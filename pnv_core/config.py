@@ -56,7 +56,12 @@ class Config:
         "where the processor multiplies it natively, else float32",
         choices=("auto", "float32", "bfloat16"),
     )
-    threads: int = setting(2, "threads of the network and of matching; 0 = all cores", low=0, high=256)
+    threads: int = setting(
+        2,
+        "threads; with verification half of them for the network, half for local features; 0 = all cores",
+        low=0,
+        high=256,
+    )
     image_width: int = setting(
         0, "width the image is resized to; 0 = as the model was trained", unit="px", low=0, high=8192
     )

@@ -61,6 +61,16 @@ def workers(threads: int) -> Workers:
     return _workers(threads or len(os.sched_getaffinity(0)))
 
 
+def shared(threads: int, verified: bool) -> tuple[int, int]:
+    """Of this many threads (0 = as many as the process may use) those of the network and those of local features.
+
+    Both run at once, and each costs least processor time in few threads. Without verification the network has all.
+    """
+    count = threads or len(os.sched_getaffinity(0))
+    of_features = count // 2 if verified else 0
+    return count - of_features, max(1, of_features)
+
+
 def spans(length: int, parts: int, align: int = 1) -> list[tuple[int, int]]:
     """0..length cut into at most `parts` spans of nearly equal length, each starting at a multiple of `align`."""
     units = -(-length // align)

@@ -11,6 +11,7 @@ from pnv_core.config import Config
 from pnv_core.decide.calibration import Calibration, calibration_for
 from pnv_core.decide.consistency import Steps, by_id
 from pnv_core.decide.order import Order
+from pnv_core.threads import workers
 from pnv_core.types import NO_PICTURE, Evidence, ImageRef, LoopClosure, PatchMatches, PlaceDescriptor, Reason
 from pnv_core.verify.reranker import Reranker, SpatialResult
 from pnv_core.verify.verifier import VERIFIERS, hull_area
@@ -78,9 +79,7 @@ class Judge:
             cameras = [closure.match.camera for closure, _, _ in found]
             shown = [(picture, camera) for picture, camera in zip(kept, cameras, strict=False) if picture]
             self.verifier.prepare([(descriptor.thumbnail, query.camera), *shown], self.reranker.workers)
-            checks = self.reranker.workers.map(
-                lambda pair: self.verifier.check(descriptor.thumbnail, query.camera, *pair), shown
-            )
+            checks = workers(1).map(lambda pair: self.verifier.check(descriptor.thumbnail, query.camera, *pair), shown)
             places = [place for place, picture in enumerate(kept) if picture]
             examined = [(found[place][0].match, check) for place, check in zip(places, checks, strict=True)]
             for place, check in zip(places, checks, strict=True):

@@ -14,6 +14,7 @@ from pnv_core.describe.checkpoints import load_checkpoint
 from pnv_core.describe.download import cache_folder, resolve_weights
 from pnv_core.describe.model_files import Model, load_model, save_model
 from pnv_core.errors import ConfigError, ImageError, ModelError
+from pnv_core.threads import shared
 from pnv_core.types import PatchGrid, PlaceDescriptor
 
 _TEXTURE_PX = 16  # side of the squares that count as textured or not
@@ -105,8 +106,9 @@ def _describing(model: Model, config: Config) -> Describing:
         return TorchDescribing(model, windows, config.threads, config.trunk_precision, torch_device(config.device))
     from pnv_core.describe.openvino_describing import OpenVinoDescribing
 
+    threads, _ = shared(config.threads, bool(config.verify))
     size, cache = (config.image_width, config.image_height), cache_folder() / "openvino"
-    return OpenVinoDescribing(model, size, windows, config.threads, config.trunk_precision, cache)
+    return OpenVinoDescribing(model, size, windows, threads, config.trunk_precision, cache)
 
 
 class Describer:

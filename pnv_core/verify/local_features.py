@@ -19,7 +19,7 @@ from PIL import Image
 
 from pnv_core.config import Config
 from pnv_core.describe.download import cache_folder
-from pnv_core.threads import Workers
+from pnv_core.threads import Workers, shared
 from pnv_core.verify.feature_codes import features_only, pack, packed, picture_of, unpack
 from pnv_core.verify.matching import mutual_maxima, similarities
 from pnv_core.verify.verifier import RATIO, EpipolarCheck, hull_area
@@ -159,7 +159,8 @@ class XFeatVerifier:
 
         config = config or Config()
         precision = "bfloat16" if "BF16" in fast_precisions() else "float32"  # matched alike, twice as fast
-        self._xfeat = XFeat(WIDTH, MOST, config.threads, precision, cache_folder() / "openvino")
+        _, threads = shared(config.threads, bool(config.verify))
+        self._xfeat = XFeat(WIDTH, MOST, threads, precision, cache_folder() / "openvino")
         self._features: OrderedDict[bytes, tuple[LocalFeatures, float]] = OrderedDict()
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:

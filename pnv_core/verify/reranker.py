@@ -15,6 +15,7 @@ from pnv_core.verify.spatial import fused_score, ransac_score, rapid_spatial_sco
 
 Rows = NDArray[np.float32]  # patch descriptors made ready for matching
 
+_LARGE = 500_000  # numbers of a query's patches; of fewer the threads wait for each other more than they help
 _SEARCHES = {"ransac": homography_inliers, "usac": usac_inliers}
 
 
@@ -45,9 +46,12 @@ class Reranker:
         return self._score(query, _rows(query), reference)
 
     def scores(self, query: PlaceDescriptor, references: Sequence[PlaceDescriptor]) -> list[SpatialResult]:
-        """`score` of every reference, in their order, in the threads of the Config."""
+        """`score` of every reference, in their order; large ones in the threads of the Config."""
         rows = _rows(query)
-        return self.workers.map(lambda reference: self._score(query, rows, reference), references)
+        large = sum(grid.size for grid in rows) > _LARGE
+        return (self.workers if large else workers(1)).map(
+            lambda reference: self._score(query, rows, reference), references
+        )
 
     def _score(self, query: PlaceDescriptor, rows: Sequence[Rows], reference: PlaceDescriptor) -> SpatialResult:
         return self._verified(query, reference, _matches(rows, reference))
