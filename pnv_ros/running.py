@@ -22,6 +22,7 @@ from pnv_ros.parameters import DECLARED
 
 UNUSABLE_INPUT = 2
 _ARENA_MAX = -8  # malloc.h
+_SWITCH_S = 0.0005  # both halves of the recogniser and the callbacks wait for each other's numpy calls, not 5 ms
 
 
 class Spinning:
@@ -88,6 +89,7 @@ def main(args: list[str] | None = None) -> int:
         print(f"place_recognizer: {' '.join(others)}; {how}", file=sys.stderr)
         return UNUSABLE_INPUT
     _few_heaps()
+    sys.setswitchinterval(_SWITCH_S)
     ending: SimpleQueue[BaseException | int] = SimpleQueue()  # its put may interrupt its get, as signal handlers do
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: ending.put(number))
