@@ -129,7 +129,7 @@ class Config:
         live=True,
     )
     odometry_slack_m: float = setting(
-        10.0, "how far apart two views of one place may lie", unit="m", low=0.0, live=True
+        10.0, "how far apart two views of one place may lie; a fifth of it in height", unit="m", low=0.0, live=True
     )
     min_travelled_m: float = setting(
         1.0, "least way gone between two visits, where odometry is given", unit="m", low=0.0, live=True
