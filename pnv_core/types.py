@@ -166,6 +166,7 @@ class Evidence:
     own_matches: int = 0  # of those: nearer than to any feature of the examined candidates elsewhere
     likeness: float = 0.0  # of all: log of the distance between features of one image over that of matched ones
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
+    near_inliers: int = 0  # of the best examined one near the match in its sequence, itself included
     background: float = 0.0  # similarity of the fifth most similar keyframe elsewhere; of a young map, the middle one
 
 

@@ -8,6 +8,7 @@ from pnv_core.decide.consistency import DOUBT, SequenceMemory, confirmed, window
 from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
+_FAR_BETTER = 4
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
@@ -32,13 +33,18 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)
-    if not agreed and closure.score < config.sure_score:
+    if not agreed and (closure.score < config.sure_score or outdone(evidence)):
         return replace(closure, reason=Reason.UNCONFIRMED)
     if not alone and ambiguous(evidence):
         longer = sequence.path(closure, window_of(wanted + DOUBT))
         if not confirmed(longer, wanted + DOUBT):
             return replace(closure, reason=Reason.AMBIGUOUS)
     return replace(closure, score=belief, accepted=True)
+
+
+def outdone(evidence: Evidence) -> bool:
+    """Whether a keyframe near the match is supported far better: this one shows the place from farther along."""
+    return evidence.near_inliers > _FAR_BETTER * evidence.local_inliers
 
 
 def ambiguous(evidence: Evidence) -> bool:

@@ -116,20 +116,17 @@ class Judge:
         return fifth if len(around) >= AROUND else max(fifth, around[len(around) // 2][1])
 
     def _beside_rivals(self, closure: LoopClosure, all_of_query: Sequence[LoopClosure]) -> LoopClosure:
-        """With the most support that any other place of the match's own sequence has."""
+        """With the most support that any other place of the match's own sequence has, and that its own place has."""
         there, evidence = closure.match, closure.evidence
         assert evidence is not None
-        most = max(
-            (
-                c.evidence.local_inliers
-                for c in all_of_query
-                if c.evidence is not None
-                and (c.match.robot, c.match.session) == (there.robot, there.session)
-                and self._apart(c.match, there)
-            ),
-            default=0,
-        )
-        return replace(closure, evidence=replace(evidence, rival_inliers=max(most, 0)))
+        rival = near = 0
+        for c in all_of_query:
+            if c.evidence is not None and (c.match.robot, c.match.session) == (there.robot, there.session):
+                if self._apart(c.match, there):
+                    rival = max(rival, c.evidence.local_inliers)
+                else:
+                    near = max(near, c.evidence.local_inliers)
+        return replace(closure, evidence=replace(evidence, rival_inliers=rival, near_inliers=near))
 
     def _closure(
         self, query: ImageRef, match: ImageRef, evidence: Evidence, result: SpatialResult, min_texture: float

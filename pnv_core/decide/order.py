@@ -11,18 +11,15 @@ from pnv_core.types import Evidence, LoopClosure
 
 _SPATIAL = 0.2  # of the logarithm of the spatial score, against the cosine
 _LEAST_SPATIAL = 0.01
-_LOCAL = 0.1  # of the logarithm of the local inliers
-_LEAST_LOCAL = 4  # and of what no local feature examined
-_OWN = 0.1  # of the logarithm of the matches that no other candidate has as near
-_LEAST_OWN = 20
+_OWN = 0.2  # of the logarithm of the local matches that no other candidate has as near
+_LEAST_OWN = 10  # and of what no local feature examined
 
 
 def standing(evidence: Evidence) -> float:
     """Grows with similarity, spatial score and what local features say; only differences within a query count."""
     spatial = math.log(max(evidence.spatial, _LEAST_SPATIAL) / _LEAST_SPATIAL)
-    local = math.log(max(evidence.local_inliers, _LEAST_LOCAL) / _LEAST_LOCAL)
     own = math.log(max(evidence.own_matches, _LEAST_OWN) / _LEAST_OWN)
-    return evidence.similarity + _SPATIAL * spatial + _LOCAL * local + _OWN * own
+    return evidence.similarity + _SPATIAL * spatial + _OWN * own
 
 
 class Order:

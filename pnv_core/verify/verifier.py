@@ -43,10 +43,13 @@ class EpipolarCheck:
     def matches_beside(self, rivals: Sequence["EpipolarCheck"]) -> int:
         """How many features of the query are matched nearer, by Lowe's ratio, than any of the rivals has them.
 
-        `rivals` are the same query against other places; of none, every match counts.
+        `rivals` are the same query against other places; of none, every match counts. Where `nearest` is not known, the
+        inliers count.
         """
         others = [rival.nearest for rival in rivals if rival.nearest is not None]
-        if self.numbers is None or self.nearest is None or not others:
+        if self.numbers is None or self.nearest is None:
+            return self.inliers
+        if not others:
             return len(self.inlier)
         elsewhere = np.max([nearest[self.numbers] for nearest in others], axis=0)
         return int((1.0 - self.nearest[self.numbers] < RATIO**2 * (1.0 - elsewhere)).sum())

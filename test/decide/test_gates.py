@@ -38,6 +38,17 @@ def test_a_look_that_occurs_elsewhere_is_ambiguous_until_the_way_has_agreed_for_
     assert verdicts(8, score, inliers=30, rival=8)[2:] == [None] * 6
 
 
+def test_a_sure_closure_that_a_neighbouring_keyframe_outdoes_by_far_waits_for_others_to_agree():
+    alone = seen(100, 10, 0.95, inliers=40, rival=0)
+    sequence = SequenceMemory()
+    sequence.remember("front", [alone], window_of(CONFIG.consistency + DOUBT))
+    assert alone.evidence is not None
+    for near, accepted in ((150, True), (170, False)):
+        beside = replace(alone, evidence=replace(alone.evidence, near_inliers=near))
+        assert decided(beside, CONFIG, sequence).accepted is accepted
+        assert accepted or decided(beside, CONFIG, sequence).reason is Reason.UNCONFIRMED
+
+
 def test_support_that_chance_gives_elsewhere_raises_no_doubt():
     assert verdicts(3, 0.7, inliers=10, rival=8)[-1] is None
 

@@ -11,8 +11,8 @@ from pnv_core.decide.order import Order, standing
 from pnv_core.types import Evidence, ImageRef, LoopClosure
 
 
-def closure(match: int, similarity: float, spatial: float, inliers: int = -1) -> LoopClosure:
-    evidence = Evidence(similarity, spatial, 10, local_inliers=inliers)
+def closure(match: int, similarity: float, spatial: float, own: int = 0) -> LoopClosure:
+    evidence = Evidence(similarity, spatial, 10, own_matches=own)
     here, there = ImageRef(99, 0, "front"), ImageRef(match, 0, "front")
     return LoopClosure(here, there, 0.5, similarity, spatial, 10, False, evidence=evidence)
 
@@ -32,8 +32,8 @@ def test_patches_alone_do_not_put_a_place_of_another_look_first_but_in_the_paper
     assert ranked(ALIKE, Config.make("speed")) == [1, 0]
 
 
-def test_local_features_that_agree_put_a_candidate_first():
-    assert ranked([ALIKE[0], closure(1, 0.40, 0.09, inliers=40)], Config.make()) == [1, 0]
+def test_local_features_that_no_other_place_has_put_a_candidate_first():
+    assert ranked([ALIKE[0], closure(1, 0.40, 0.09, own=60)], Config.make()) == [1, 0]
 
 
 def test_an_accepted_closure_comes_before_a_refused_one():
@@ -44,10 +44,10 @@ def test_of_equal_candidates_the_older_comes_first():
     assert ranked([closure(5, 0.5, 0.1), closure(2, 0.5, 0.1)], Config.make()) == [2, 5]
 
 
-@pytest.mark.parametrize("name", ["similarity", "spatial", "local_inliers", "own_matches"])
-@given(st.floats(0, 1), st.floats(0, 1), st.integers(-1, 200), st.floats(0, 1))
-def test_more_of_any_evidence_never_moves_a_candidate_back(name, similarity, spatial, inliers, more):
-    evidence = Evidence(similarity, spatial, 10, local_inliers=inliers)
-    step = round(100 * more) if name in ("local_inliers", "own_matches") else more
+@pytest.mark.parametrize("name", ["similarity", "spatial", "own_matches"])
+@given(st.floats(0, 1), st.floats(0, 1), st.integers(0, 200), st.floats(0, 1))
+def test_more_of_any_evidence_never_moves_a_candidate_back(name, similarity, spatial, own, more):
+    evidence = Evidence(similarity, spatial, 10, own_matches=own)
+    step = round(100 * more) if name == "own_matches" else more
     raised = replace(evidence, **{name: getattr(evidence, name) + step})
     assert standing(raised) >= standing(evidence)
