@@ -44,7 +44,7 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
 
 def outdone(evidence: Evidence) -> bool:
     """Whether a keyframe near the match is supported far better: this one shows the place from farther along."""
-    return evidence.near_inliers > _FAR_BETTER * evidence.local_inliers
+    return 0 <= _FAR_BETTER * evidence.local_inliers < evidence.near_inliers
 
 
 def ambiguous(evidence: Evidence) -> bool:
