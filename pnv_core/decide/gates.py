@@ -8,7 +8,7 @@ from pnv_core.decide.consistency import DOUBT, SequenceMemory, confirmed, window
 from pnv_core.types import NO_PICTURE, Evidence, LoopClosure, Reason
 
 _ALIKE = 0.4  # of the match's own support
-_FAR_BETTER = 4
+_FAR_BETTER = 3
 
 
 def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impossible: bool = False) -> LoopClosure:
@@ -33,7 +33,7 @@ def decided(closure: LoopClosure, config: Config, sequence: SequenceMemory, impo
         return replace(closure, reason=Reason.NOT_VERIFIED)
     if impossible:
         return replace(closure, reason=Reason.ODOMETRY)
-    if not agreed and (closure.score < config.sure_score or outdone(evidence)):
+    if outdone(evidence) or (not agreed and closure.score < config.sure_score):
         return replace(closure, reason=Reason.UNCONFIRMED)
     if not alone and ambiguous(evidence):
         longer = sequence.path(closure, window_of(wanted + DOUBT))

@@ -38,12 +38,12 @@ def test_a_look_that_occurs_elsewhere_is_ambiguous_until_the_way_has_agreed_for_
     assert verdicts(8, score, inliers=30, rival=8)[2:] == [None] * 6
 
 
-def test_a_sure_closure_that_a_neighbouring_keyframe_outdoes_by_far_waits_for_others_to_agree():
+def test_a_closure_that_a_keyframe_near_its_match_outdoes_by_far_is_left_to_that():
     alone = seen(100, 10, 0.95, inliers=40, rival=0)
     sequence = SequenceMemory()
     sequence.remember("front", [alone], window_of(CONFIG.consistency + DOUBT))
     assert alone.evidence is not None
-    for near, accepted in ((150, True), (170, False)):
+    for near, accepted in ((110, True), (130, False)):
         beside = replace(alone, evidence=replace(alone.evidence, near_inliers=near))
         assert decided(beside, CONFIG, sequence).accepted is accepted
         assert accepted or decided(beside, CONFIG, sequence).reason is Reason.UNCONFIRMED
