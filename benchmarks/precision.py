@@ -10,10 +10,12 @@ Recall@1 by the global vector, by patches and re-ranked on the sets of benchmark
 references in one precision, and with queries in another one than the map. bfloat16 leaves the trunk's first layers and
 what follows the trunk in float32, as the product does. int8: convolutions quantised by NNCF on
 training photographs. Times are those of the trunk in turns on one image; ONNX Runtime has no bfloat16 convolutions.
-Needs nncf, onnx and onnxruntime, which the product does not: pip install 'pnv_ros[benchmarks]'
+int8 needs nncf, ONNX Runtime onnx and onnxruntime, which the product does not need (pip install 'pnv_ros[benchmarks]');
+without them they are left out.
 """
 
 import argparse
+import importlib.util
 import io
 import random
 import tempfile
@@ -88,6 +90,10 @@ def in_onnxruntime(describer: Describer, threads: int) -> Callable[[], Any]:
     return lambda: session.run(None, pixels)
 
 
+def _installed(*names: str) -> bool:
+    return all(importlib.util.find_spec(name) is not None for name in names)
+
+
 def times(describer: Describer, images: list[NDArray[np.uint8]], threads: int, rounds: int) -> None:
     """The trunk of the default model in every library and precision, in turns."""
     model, size, pixels = describer.model, describer.image_size, images[0][None]
@@ -95,14 +101,16 @@ def times(describer: Describer, images: list[NDArray[np.uint8]], threads: int, r
     eager.load_state_dict({n: torch.from_numpy(t) for n, t in model.part("trunk").items()})
     batch = torch.from_numpy(pixels).permute(0, 3, 1, 2).float() / 255
     torch.set_num_threads(threads)
-    graph = int8(trunk_maps(model, size), [(i[None],) for i in images])
-    sides = {
+    sides: dict[str, Callable[[], Any]] = {
         "torch eager": lambda: eager(batch),
-        "onnxruntime float32": in_onnxruntime(describer, threads),
         "openvino float32": partial(Compiled(partial(trunk_maps, model, size), threads), pixels),
         "openvino bfloat16": partial(Compiled(partial(trunk_maps, model, size, True), threads), pixels),
-        "openvino int8": partial(Compiled(lambda: graph, threads), pixels),
     }
+    if _installed("nncf"):
+        graph = int8(trunk_maps(model, size), [(i[None],) for i in images])
+        sides["openvino int8"] = partial(Compiled(lambda: graph, threads), pixels)
+    if _installed("onnx", "onnxruntime"):
+        sides["onnxruntime float32"] = in_onnxruntime(describer, threads)
     with torch.inference_mode():
         compared(f"trunk at {size[0]}x{size[1]}", sides, rounds)
 
@@ -179,7 +187,9 @@ def main() -> None:
     images = photographs(describers["float32"], args.train, 300)
     times(describers["float32"], images, args.threads, args.rounds)
     if not args.quick:
-        recalls(describers | {"int8": int8_describer(describers["float32"], images)}, args)
+        if _installed("nncf"):
+            describers["int8"] = int8_describer(describers["float32"], images)
+        recalls(describers, args)
 
 
 if __name__ == "__main__":
