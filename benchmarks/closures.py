@@ -4,7 +4,7 @@
     python -m benchmarks.closures judge --shared ../shared [--weights MODEL] [--plot OUT.png] [NAMES]
 
 `fit` uses the sets that may train a shipped model and writes the calibration into the model file; `judge` reports
-on the others. Descriptors are kept in a cache folder by the model's fingerprint.
+on the others. Descriptors are kept in a cache folder by the model's fingerprint and precision.
 """
 
 import argparse
@@ -45,7 +45,7 @@ class RememberedDescriber:
         self._describer = describer
         c = self.config
         sizes = "-".join(map(str, c.patch_sizes))
-        folder = cache / f"{describer.fingerprint[:12]}_{c.image_width}x{c.image_height}_{sizes}"
+        folder = cache / f"{describer.fingerprint[:12]}_{c.trunk_precision}_{c.image_width}x{c.image_height}_{sizes}"
         folder.mkdir(parents=True, exist_ok=True)
         keys = zlib.crc32("\n".join(images.keys).encode())
         self._file = folder / f"{images.name}_{keys:08x}.npz"
