@@ -52,13 +52,13 @@ class Config:
     )
     trunk_precision: str = setting(
         "auto",
-        "arithmetic of the describing network after its first layers; auto: bfloat16 for the default model in OpenVINO "
+        "arithmetic of the describing network after its first layers; auto: bfloat16 for EfficientNet-Lite in OpenVINO "
         "where the processor multiplies it natively, else float32",
         choices=("auto", "float32", "bfloat16"),
     )
     threads: int = setting(
         2,
-        "threads; with verification half of them for the network, half for local features; 0 = all cores",
+        "threads of the networks: with verification half for the descriptor, half for local features; 0 = all cores",
         low=0,
         high=256,
     )

@@ -1,6 +1,7 @@
 """PlaceRecognizer: one frame in, its loop-closure candidates out. Deterministic, no clock, no ROS."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -84,8 +85,11 @@ class PlaceRecognizer:
             return None
         began = self.budget.now()
         with self.timer.stage("describe"):
-            descriptor, kept = self._described(frame, self.keyframes.changing(frame))
+            at_once = bool(self.config.verify) and self.keyframes.changing(frame)
+            descriptor, kept = self._described(frame, at_once)
         if not self.keyframes.differs(frame, descriptor):
+            if at_once and self._workers.threads > 1:
+                kept()  # nothing is left running when a frame is done with
             return None
         predecessor = self.keyframes.similarity(frame, descriptor)
         self.keyframes.take(frame, descriptor)
@@ -122,21 +126,27 @@ class PlaceRecognizer:
         self.sequence.remember(frame.camera, closures, window_of(config.consistency + DOUBT))
         return sorted((self._decided(c, config) for c in closures), key=self.judge.order)
 
-    def _described(self, frame: Frame, also_kept: bool) -> tuple[PlaceDescriptor, Callable[[], bytes]]:
+    def _described(self, frame: Frame, at_once: bool) -> tuple[PlaceDescriptor, Callable[[], bytes]]:
         """The descriptor, and what gives what the verifier keeps: made at the same time where that is wanted."""
 
         def keep() -> bytes:
             return self.judge.verifier.keep(frame.rgb, frame.camera, frame.valid)
 
-        beside = self._workers.beside(keep) if self.config.verify and also_kept else keep
-        return self.describer.describe(frame.rgb, frame.valid), beside
+        kept = self._workers.beside(keep) if at_once else keep
+        try:
+            return self.describer.describe(frame.rgb, frame.valid), kept
+        except Exception:
+            if at_once:
+                with suppress(Exception):
+                    kept()
+            raise
 
     def look_up(self, frame: Frame) -> list[LoopClosure]:
         """Every candidate for an image by itself, best first; nothing is remembered, no keyframe is too young.
 
         Without a sequence only `sure_score` accepts. Raises ImageError for an unusable image.
         """
-        descriptor, kept = self._described(frame, True)
+        descriptor, kept = self._described(frame, bool(self.config.verify))
         if self.config.verify:
             descriptor = replace(descriptor, thumbnail=kept())
         around = self.database.nearest(descriptor.global_vector, max(self.config.candidates, AROUND), _LATEST_NS, 0)

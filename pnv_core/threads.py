@@ -3,6 +3,7 @@
 import functools
 import itertools
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -20,6 +21,7 @@ class Workers:
     def __init__(self, threads: int) -> None:
         self.threads = threads
         self._pool = ThreadPoolExecutor(threads, thread_name_prefix="pnv") if threads > 1 else None
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="pnv beside") if threads > 1 else None
 
     def map(self, function: Callable[[Any], T], parts: Iterable[Any]) -> list[T]:
         """The results in the order of the parts; the first exception is raised."""
@@ -30,20 +32,41 @@ class Workers:
             return list(self._pool.map(function, parts))
 
     def beside(self, function: Callable[[], T]) -> Callable[[], T]:
-        """Starts the function in another thread, where there is one; what is given waits for its result."""
-        return function if self._pool is None else self._pool.submit(function).result
+        """Starts the function in a thread of its own, where there is one; what is given waits for its result."""
+        return function if self._beside is None else self._beside.submit(function).result
+
+
+_alone: list[Callable[[], None]] = []  # one per caller of `alone`; the first holds what puts the numbers back
+_counting = threading.Lock()
 
 
 @contextmanager
 def alone() -> Iterator[None]:
-    """Meanwhile numpy's BLAS and OpenCV run in the thread that calls them: the parts are the parallelism."""
+    """Meanwhile numpy's BLAS and OpenCV run in the thread that calls them: the parts are the parallelism.
+
+    The numbers are the process's, so of several threads that ask at once the first changes and the last restores them.
+    """
+    with _counting:
+        _alone.append(_alone[0] if _alone else _in_one_thread())
+    try:
+        yield
+    finally:
+        with _counting:
+            restore = _alone.pop()
+            if not _alone:
+                restore()
+
+
+def _in_one_thread() -> Callable[[], None]:
     before = cv2.getNumThreads()
-    with _blas().limit(limits=1, user_api="blas"):
-        cv2.setNumThreads(1)
-        try:
-            yield
-        finally:
-            cv2.setNumThreads(before)
+    limits = _blas().limit(limits=1, user_api="blas")
+    cv2.setNumThreads(1)
+
+    def restore() -> None:
+        cv2.setNumThreads(before)
+        limits.restore_original_limits()
+
+    return restore
 
 
 @functools.cache

@@ -19,6 +19,7 @@ from pnv_core.maps import Autosave, SaveReport
 from pnv_core.pose.relative_poses import RelativePoses
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.rotations import mount_of
+from pnv_core.threads import shared
 from pnv_core.timing import StageTimer
 from pnv_core.types import PlaceDescriptor
 from pnv_core.verify.local_features import KEPT_BYTES
@@ -246,12 +247,13 @@ class PlaceRecognizerNode(LifecycleNode):
     def _summary(self, describer: Describer, per_keyframe: int) -> str:
         config, info = describer.config, describer.model.info
         budget = config.memory_budget_mb * 1e6
+        network, _ = shared(config.threads, bool(config.verify))
         return "\n".join(
             [
                 "place recogniser",
                 f"  model        {config.weights} ({info.trunk}, K = {describer.model.clusters}, "
                 f"D = {describer.model.global_dim}, {describer.fingerprint[:12]})",
-                f"  network      {describer.backend}, {config.trunk_precision}, {config.threads or 'all'} threads",
+                f"  network      {describer.backend}, {config.trunk_precision}, {network} thread{'s' * (network > 1)}",
                 f"  preset       {config.preset}: {config.image_width}x{config.image_height} px, patches "
                 f"{', '.join(map(str, config.patch_sizes))}, {config.scorer}, accepted from {config.accept_score:g}",
                 f"  memory       {per_keyframe / 1e6:.2f} MB per keyframe, {config.memory_budget_mb:g} MB for about "

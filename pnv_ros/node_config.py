@@ -35,7 +35,7 @@ class NodeConfig:
     )
     odometry_topic: str = setting(
         "",
-        "nav_msgs/Odometry: rules closures out, scales ~/relative_pose; places keyframes where pose_topic is empty",
+        "nav_msgs/Odometry, z up: rules closures out, scales ~/relative_pose; places keyframes without pose_topic",
     )
     camera_in_base: tuple[float, ...] = setting(
         (),

@@ -14,6 +14,7 @@ from msg_adapters.images import message_to_frame
 from pnv_core.config import live_settings
 from pnv_core.errors import ImageError, PnvError
 from pnv_core.recognizer import PlaceRecognizer, Seen
+from pnv_core.threads import workers
 from pnv_core.types import Frame, LoopClosure
 from pnv_fleet.fleet import Fleet
 from pnv_ros.depths import Depths
@@ -58,7 +59,7 @@ class Recognition:
         self._shown: Settings | None = None  # what the second thread has taken
         self._failed = failed
         self._looking, self._finishing = threading.Lock(), threading.Lock()
-        alone = recognizer.config.threads == 1
+        alone = workers(recognizer.config.threads).threads == 1
         self._second = None if alone else ThreadPoolExecutor(1, thread_name_prefix="recognition")
         self._sizes: dict[str, tuple[int, int]] = {}
         self._complained: dict[str, float] = {}

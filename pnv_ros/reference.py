@@ -23,7 +23,7 @@ REASONS = {
     Reason.ACCEPTED: "accepted",
     Reason.LOW_SCORE: "score below accept_score",
     Reason.LOW_TEXTURE: "the image shows next to nothing (min_texture)",
-    Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency)",
+    Reason.UNCONFIRMED: "neighbouring keyframes do not agree (consistency), or one near the match agrees far better",
     Reason.ODOMETRY: "the jump is impossible by odometry",
     Reason.NOT_RERANKED: "not scored in full, to keep within time_budget_ms",
     Reason.NOT_VERIFIED: "not among the best that local features examined (verify), or too few of them agree",

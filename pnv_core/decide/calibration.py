@@ -140,7 +140,7 @@ class Calibration:
         fitted = replace(self, patch_strides=strides, patch_weights=self.patch_weights or own["patch_weights"])
         found = {name: getattr(fitted, name) for name, value in own.items() if getattr(fitted, name) != value}
         former = sorted({*self.patches.weights, *self.verified.weights} - set(_VALUES))
-        return found | ({"features": " and ".join(former) + " of an earlier release"} if former else {})
+        return found | ({"features": " and ".join(former) + " of an earlier release (pnv calibrate)"} if former else {})
 
     def to_json(self) -> dict[str, Any]:
         return asdict(self)

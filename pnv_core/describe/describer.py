@@ -100,13 +100,13 @@ def precision_of(config: Config, model: Model) -> str:
 
 def _describing(model: Model, config: Config) -> Describing:
     windows = list(zip(config.patch_sizes, config.patch_strides, strict=True))
+    threads, _ = shared(config.threads, bool(config.verify))
     if backend_of(config) == "torch":
         from pnv_core.describe.torch_model import TorchDescribing, torch_device  # seconds to import
 
-        return TorchDescribing(model, windows, config.threads, config.trunk_precision, torch_device(config.device))
+        return TorchDescribing(model, windows, threads, config.trunk_precision, torch_device(config.device))
     from pnv_core.describe.openvino_describing import OpenVinoDescribing
 
-    threads, _ = shared(config.threads, bool(config.verify))
     size, cache = (config.image_width, config.image_height), cache_folder() / "openvino"
     return OpenVinoDescribing(model, size, windows, threads, config.trunk_precision, cache)
 

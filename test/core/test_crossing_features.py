@@ -256,7 +256,11 @@ class Crossing(RuleBasedStateMachine):
             if c.accepted:
                 assert c.score >= config.accept_score
                 assert not config.verify or c.evidence.local_inliers >= 0
-            if c.reason is Reason.UNCONFIRMED:
+            close = [o.evidence.local_inliers for o in closures if o.match.session == c.match.session
+                     and abs(self.steps(o.match, c.match)) <= 10]  # fmt: skip
+            outdone = c.evidence.local_inliers >= 0 and max(close) > 3 * c.evidence.local_inliers
+            assert not (outdone and c.accepted)
+            if c.reason is Reason.UNCONFIRMED and not outdone:
                 assert config.consistency > 1
                 assert c.score < config.sure_score
             for other in (o.match for o in closures if same_sequence(o.match, c.match)):

@@ -70,7 +70,7 @@ def test_the_global_vector_is_the_projected_vlad_beside_the_projected_means(deep
 
 def test_a_mask_hides_cells_from_the_pooled_half_too():
     """What changes well under the mask moves the vector by a tenth of what it does without one, or less."""
-    describer = Describer(pooled_model(deep=False))
+    describer = Describer(pooled_model(deep=False), Config(trunk_precision="float32"))  # two vectors are nearly equal
     first, second = image(1), image(1)
     second[64:] = 0
     valid = np.ones((HEIGHT, WIDTH), bool)

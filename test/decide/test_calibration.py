@@ -160,7 +160,8 @@ def test_a_calibration_for_other_patches_or_another_scorer_is_not_used():
     former = stored | {"verified": {"bias": -4.0, "weights": {"agreement": 1.0}}}
     assert calibration_for(former, CONFIG) is CONSERVATIVE
     assert why_conservative(former, CONFIG) == (
-        "the model's calibration is for features = agreement of an earlier release: a conservative score decides"
+        "the model's calibration is for features = agreement of an earlier release (pnv calibrate): "
+        "a conservative score decides"
     )
 
 

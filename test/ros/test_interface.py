@@ -41,7 +41,8 @@ def test_the_interface_page_names_every_topic_and_service_of_the_node(idle, list
 
 
 def test_the_start_up_block_says_what_runs(idle):
-    for words in ("model        default (", "network      openvino, ",
+    assert re.search(r"network      openvino, (float32|bfloat16), \d+ thread", idle.output)
+    for words in ("model        default (",
                   "preset       default: ", "MB per keyframe",
                   "listens to   /camera/image_raw (Image, best effort, volatile)",
                   "publishes    /loop_closures"):  # fmt: skip

@@ -100,11 +100,13 @@ def test_frozen_layers_keep_their_weights(pool, imagenet_file, tmp_path):
 
 
 def test_the_last_layer_is_never_frozen(pool, imagenet_file, tmp_path):
+    before = trainer(pool, imagenet_file, tmp_path / "new").model.tensors()["trunk.expand.weight"].clone()
     few, many = (
         trainer(pool, imagenet_file, tmp_path / str(n), steps=1, warmup=0, frozen_layers=n).run().tensors()
         for n in (16, 99)
     )
     assert all(torch.equal(few[name], many[name]) for name in few)
+    assert not torch.equal(before, few["trunk.expand.weight"])
 
 
 def test_a_pool_gives_what_the_frozen_layers_give(pool, imagenet_file, picture_folder):
