@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 
 import cv2
 import numpy as np
@@ -31,7 +32,7 @@ from pnv_core.networks.openvino_backend import (
     image_input,
 )
 from pnv_core.recognizer import PlaceRecognizer
-from pnv_core.threads import spans, workers
+from pnv_core.threads import alone, shared, spans, workers
 from pnv_core.timing import StageTimer, TimeBudget
 from pnv_core.types import Frame, Reason
 from pnv_core.verify.homography import homography_inliers, usac_inliers
@@ -419,6 +420,7 @@ def test_a_robot_imports_neither_torch_nor_a_compiler(tmp_path):
     """A fresh process that describes, stores, re-ranks and verifies; the second start finds what the first compiled."""
     program = """
 import sys
+import threading
 import numpy as np
 from pnv_core import Config, Describer, Frame, PlaceRecognizer, load_describer
 
@@ -458,3 +460,35 @@ def test_usac_finds_nearly_the_inliers_of_ransac_and_the_same_ones_each_time(sha
         assert np.mean(usac) == pytest.approx(np.mean(ransac), rel=0.05)
     else:  # what agrees by chance speaks for nothing
         assert np.mean(usac) <= np.mean(ransac)
+
+
+def test_threads_that_work_alone_at_once_put_opencvs_number_back_together():
+    """Entered one after another and left in the same order, as two threads do."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(3)
+    try:
+        first, second = alone(), alone()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert cv2.getNumThreads() == 1
+        second.__exit__(None, None, None)
+        assert cv2.getNumThreads() == 3
+    finally:
+        cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize(("threads", "verified", "parts"), [
+    (1, True, (1, 1)), (2, True, (1, 1)), (3, True, (2, 1)), (4, True, (2, 2)), (4, False, (4, 1)), (1, False, (1, 1)),
+])  # fmt: skip
+def test_network_and_local_features_share_the_threads(threads, verified, parts):
+    assert shared(threads, verified) == parts
+
+
+def test_what_runs_beside_waits_for_no_parts():
+    """A part that waits for what runs beside it would never end in one pool."""
+    pool = workers(2)
+    waiting = threading.Event()
+    beside = pool.beside(lambda: waiting.set() or 7)
+    assert pool.map(lambda _: waiting.wait(20), range(4)) == [True] * 4
+    assert beside() == 7

@@ -13,6 +13,7 @@ from pnv_core.decide.calibration import (
     CONSERVATIVE,
     Calibration,
     Logistic,
+    accord,
     calibration_for,
     fit_calibration,
     reliability,
@@ -86,6 +87,15 @@ def test_more_of_any_evidence_never_lowers_the_score(name, step, seed):
             {"background": e.background + step},
         ):
             assert calibration.probability(dataclasses.replace(e, **against)) <= calibration.probability(e) + 1e-12
+
+
+def test_a_lead_counts_up_to_a_bound():
+    seen = Evidence(similarity=0.9, spatial=0.5, inliers=40, local_inliers=60, local_matches=90)
+    leads = [-0.2, 0.0, 0.1, 0.15, 0.6]
+    added = [
+        accord(dataclasses.replace(seen, lead=lead)) - accord(dataclasses.replace(seen, lead=0.0)) for lead in leads
+    ]
+    assert np.allclose(added, [0.0, 0.0, 0.6, 0.9, 0.9])
 
 
 def test_an_unknown_model_believes_no_candidate_on_its_patches_alone():

@@ -1,5 +1,7 @@
 """What the judge knows of a candidate beside the pair itself."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -27,6 +29,42 @@ def test_the_background_is_the_fifth_most_similar_keyframe_elsewhere(places):
         middle = sorted(similarity, reverse=True)[places // 2]  # what counts where all of eight are neighbours
         expected = max(elsewhere[4], middle) if elsewhere else middle
         assert closure.evidence.background == pytest.approx(expected, abs=1e-5)
+
+
+class Told:
+    """A verifier that finds as many inliers as a picture says, and as many matches of its own as it is given rivals."""
+
+    side = 64
+
+    def keep(self, rgb, camera, valid=None):
+        return bytes([int(rgb.astype(int).sum()) % 251 + 1])
+
+    def prepare(self, kept, workers):
+        pass
+
+    def check(self, query, query_camera, reference, reference_camera):
+        return SimpleNamespace(
+            inliers=reference[0], spread=0.5, inlier=np.ones(9, bool), likeness=0.0, matches_beside=len
+        )
+
+
+def test_support_near_the_match_and_elsewhere_is_that_of_the_candidates_examined():
+    describer = small_describer(min_interval_s=0.0, min_change=0.0, exclude_recent_s=5.0, verify=8, candidates=12)
+    recognizer = PlaceRecognizer(describer)
+    recognizer.judge.verifier = Told()
+    for i in range(40):
+        recognizer.process(Frame(i * S, "front", noise_image(i)))
+    found = recognizer.process(Frame(1000 * S, "front", noise_image(3)))
+    examined = {c.match.id: c.evidence.local_inliers for c in found if c.evidence.local_inliers >= 0}
+    assert len(examined) == 8
+    assert all(n == Told().keep(noise_image(i), "")[0] for i, n in examined.items())
+    for c in found:
+        near = [n for i, n in examined.items() if abs(i - c.match.id) <= 10]
+        elsewhere = [n for i, n in examined.items() if abs(i - c.match.id) > 10]
+        assert c.evidence.near_inliers == max(near, default=0)
+        assert c.evidence.rival_inliers == max(elsewhere, default=0)
+        if c.match.id in examined:
+            assert c.evidence.own_matches == len(elsewhere)
 
 
 @pytest.mark.parametrize("seed", range(8))
