@@ -93,9 +93,9 @@ def precision_of(config: Config, model: Model) -> str:
         return config.trunk_precision
     if not model.trunk.precise or backend_of(config) != "openvino":
         return "float32"
-    from pnv_core.networks.openvino_backend import fast_precisions
+    from pnv_core.networks.openvino_backend import native_precision
 
-    return "bfloat16" if "BF16" in fast_precisions() else "float32"
+    return native_precision()
 
 
 def _describing(model: Model, config: Config) -> Describing:

@@ -118,6 +118,11 @@ def fast_precisions() -> list[str]:
     return list(ov.Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES"))
 
 
+def native_precision() -> str:
+    """'bfloat16' where this processor multiplies it natively, else 'float32'."""
+    return "bfloat16" if "BF16" in fast_precisions() else "float32"
+
+
 def image_input(width: int, height: int, scale: Scale | None = None) -> tuple[Node, Node]:
     """(1, H, W, 3) uint8 parameter, and the same as (1, 3, H, W) float32 in [0, 1], scaled where given.
 

@@ -154,13 +154,12 @@ class XFeatVerifier:
     side = WIDTH
 
     def __init__(self, config: Config | None = None) -> None:
-        from pnv_core.networks.openvino_backend import fast_precisions
+        from pnv_core.networks.openvino_backend import native_precision
         from pnv_core.verify.xfeat import XFeat
 
         config = config or Config()
-        precision = "bfloat16" if "BF16" in fast_precisions() else "float32"  # matched alike, twice as fast
         _, threads = shared(config.threads, bool(config.verify))
-        self._xfeat = XFeat(WIDTH, MOST, threads, precision, cache_folder() / "openvino")
+        self._xfeat = XFeat(WIDTH, MOST, threads, native_precision(), cache_folder() / "openvino")  # matched alike
         self._features: OrderedDict[bytes, tuple[LocalFeatures, float]] = OrderedDict()
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
