@@ -65,7 +65,7 @@ fleet-demo: $(READY)
 	    $(BIN)/pip install --progress-bar off -q -e ".[fleet,slam]"
 	@$(BIN)/python -m examples.fleet $(ARGS)
 
-test: $(READY)
+test: $(READY) $(MESSAGES)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 faults: $(READY)

@@ -1,7 +1,6 @@
 """The typed services, where pnv_msgs is on the machine: maps by path, the places of an image, a keyframe."""
 
 from collections.abc import Callable
-from importlib import import_module
 from typing import Any
 
 from msg_adapters.typed_closures import closures_to_typed, keyframe_to_typed
@@ -23,15 +22,15 @@ class TypedServices:
     def __init__(self, services: Services, parts: Parts) -> None:
         """`parts` gives the map and the recognition of a configured node, or raises PnvError."""
         self._parts = parts
-        try:
-            types = import_module("pnv_msgs.srv")
+        try:  # by name: in the folder of the sources the package itself is found, without anything in it
+            from pnv_msgs.srv import GetKeyframe, LoadMap, QueryImage, SaveMap
         except ImportError:
             return
         for kind, name, act in (
-            (types.SaveMap, "save_map", self._save),
-            (types.LoadMap, "load_map", self._load),
-            (types.QueryImage, "query_image", self._query),
-            (types.GetKeyframe, "get_keyframe", self._keyframe),
+            (SaveMap, "save_map", self._save),
+            (LoadMap, "load_map", self._load),
+            (QueryImage, "query_image", self._query),
+            (GetKeyframe, "get_keyframe", self._keyframe),
         ):
             services.serve(kind, name, act)
 

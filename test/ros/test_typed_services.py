@@ -7,7 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-pytest.importorskip("pnv_msgs", reason="pnv_msgs is not built")
+from msg_adapters.typed_closures import typed_type
+
+if typed_type() is None:
+    pytest.skip("pnv_msgs is not built", allow_module_level=True)
 
 from pnv_msgs.srv import GetKeyframe, LoadMap, QueryImage, SaveMap
 
@@ -71,9 +74,12 @@ def test_a_keyframe_of_a_node_that_verifies_nothing_has_no_picture(listener):
         assert node.end() == 0
 
 
-def test_without_pnv_msgs_the_node_has_the_other_services(listener):
+@pytest.mark.parametrize("found", ["None", "types.ModuleType('pnv_msgs')"], ids=["nothing", "the sources' folder"])
+def test_without_pnv_msgs_the_node_has_the_other_services(listener, found):
     code = (
-        "import sys; sys.modules['pnv_msgs'] = sys.modules['pnv_msgs.srv'] = None; import rclpy; rclpy.init()\n"
+        f"import sys, types; found = {found}\n"
+        "sys.modules |= dict.fromkeys(('pnv_msgs', 'pnv_msgs.msg', 'pnv_msgs.srv'), found)\n"
+        "import rclpy; rclpy.init()\n"
         "from pnv_ros.node import PlaceRecognizerNode; node = PlaceRecognizerNode(print)\n"
         "names = {n for n, _ in node.get_service_names_and_types_by_node('place_recognizer', '/')}\n"
         "assert '/place_recognizer/save' in names and '/place_recognizer/save_map' not in names, names"
