@@ -71,8 +71,12 @@ class Process:
     def output(self) -> str:
         return "\n".join(self.lines)
 
-    def wait_for(self, words: str, timeout: float = 60.0) -> str:
-        """The first line with these words. Fails if the process ends or says nothing of the kind."""
+    def wait_for(self, words: str, timeout: float = 60.0, meanwhile: Callable[[], Any] = lambda: None) -> str:
+        """The first line with these words. Fails if the process ends or says nothing of the kind.
+
+        `meanwhile` sends, again and again: a publisher may know the process before the process knows it, and what is
+        sent only once at best effort is lost between.
+        """
         end = time.monotonic() + timeout
         while time.monotonic() < end:
             for line in list(self.lines):
@@ -82,6 +86,7 @@ class Process:
                 self._reader.join(5)
                 if words not in self.output:
                     raise AssertionError(f"ended with {self.child.returncode} without {words!r}:\n{self.output}")
+            meanwhile()
             time.sleep(0.02)
         raise AssertionError(f"no {words!r} within {timeout} s:\n{self.output}")
 
