@@ -27,8 +27,8 @@ def folder(root: Path, rule: SequenceRule) -> Dataset:
         raise PnvError(f"{root}: holds neither matches.csv nor poses.csv")
     images = root / "images"
     listed = read_matches(matches, images, images)
-    queries = {query.resolve().parent for _, query, _ in listed}
-    references = {t.resolve().parent for _, _, true in listed for t in true}
+    queries = {query.parent.resolve() for _, query, _ in listed}
+    references = {t.parent.resolve() for _, _, true in listed for t in true}
     if queries & references:
         return _sequence(root, images if images.is_dir() else root, rule)
     return pairs_dataset(_common(queries), _common(references), matches, root.name)

@@ -275,6 +275,20 @@ def test_a_folder_with_matches_of_one_sequence(tmp_path: Path) -> None:
     check_walk(open_dataset("folder", tmp_path, rule=RULE), tmp_path / "cache")
 
 
+def test_a_folder_of_links_holds_no_more_than_the_links(tmp_path: Path) -> None:
+    for seed in range(6):
+        write(tmp_path / "pool" / f"{seed}.png", place(seed))
+    for name, seeds in (("query", (0, 1)), ("ref", (2, 3, 4))):
+        (tmp_path / "links" / name).mkdir(parents=True)
+        for seed in seeds:
+            (tmp_path / "links" / name / f"{seed}.png").symlink_to(tmp_path / "pool" / f"{seed}.png")
+    (tmp_path / "links" / "matches.csv").write_text("query,true_refs\nquery/0.png,ref/2.png\nquery/1.png,ref/3.png\n")
+    dataset = open_dataset("folder", tmp_path / "links")
+    assert [p.name for p in dataset.queries] == ["0.png", "1.png"]
+    assert [p.name for p in dataset.references] == ["2.png", "3.png", "4.png"]
+    assert not dataset.sequence
+
+
 def test_names_that_carry_the_position(tmp_path: Path) -> None:
     for i in range(3):
         write(tmp_path / "images/test/database" / f"@{100 * i}@0@x@.jpg", place(i))
