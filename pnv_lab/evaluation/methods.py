@@ -9,7 +9,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pnv_core.config import PRESETS, Config
+from pnv_core.decide.order import standing
 from pnv_core.errors import ConfigError
+from pnv_core.types import Evidence
 from pnv_core.verify.reranker import Reranker
 from pnv_lab.evaluation.extraction import Record, descriptor_of
 from pnv_lab.evaluation.local_features import LIGHTGLUE_KINDS, lightglue_scorer, sift_score
@@ -26,7 +28,8 @@ class Method:
 
     sizes: "single" (the paper's 5, or the middle one of the model's), "multi" (the model's), or explicit ones.
     fusion: "model" (its weights where it names these sizes, else equal), "equal", or explicit weights.
-    scorer: "" (retrieval only), configured, ransac, rapid, early, cross, sift, or a LightGlue kind.
+    scorer: "" (retrieval only), ransac, rapid, early, cross, sift, a LightGlue kind, or configured: as the recogniser
+    orders candidates under the settings given, before local features.
     preset: of the recogniser, in place of the settings given.
     """
 
@@ -69,7 +72,18 @@ class Method:
             score = early_fusion_score if self.scorer == "early" else cross_size_score
             return lambda q, r: score(descriptor_of(q, sizes, self.dim), descriptor_of(r, sizes, self.dim))
         reranker = self.reranker(completed)
-        return lambda q, r: reranker.score(descriptor_of(q, sizes, self.dim), descriptor_of(r, sizes, self.dim)).score
+        by_all = self.scorer == "configured" and completed.preset == "default"
+
+        def ranked_by(q: Record, r: Record) -> float:
+            query, reference = descriptor_of(q, sizes, self.dim), descriptor_of(r, sizes, self.dim)
+            result = reranker.score(query, reference)
+            if not by_all:
+                return result.score
+            return standing(
+                Evidence(float(query.global_vector @ reference.global_vector), result.score, result.inliers)
+            )
+
+        return ranked_by
 
     def reranker(self, completed: Config) -> Reranker:
         """The product's own scorer under this method's sizes and weights."""
@@ -81,7 +95,7 @@ class Method:
         else:
             fusion = (1.0 / len(sizes),) * len(sizes)
         scorer = completed.scorer if self.scorer == "configured" else self.scorer
-        if scorer not in ("ransac", "rapid"):
+        if self.scorer in ("early", "cross"):
             scorer = "ransac"
         strides = dict(zip(completed.patch_sizes, completed.patch_strides, strict=True))
         return Reranker(
@@ -100,7 +114,7 @@ def global_method() -> Method:
 
 
 def configured_method() -> Method:
-    """Patch-NetVLAD as the user's settings have it."""
+    """The recogniser's order under the user's settings."""
     return Method("patchnetvlad", "Patch-NetVLAD (as configured)", scorer="configured")
 
 

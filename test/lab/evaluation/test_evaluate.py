@@ -12,12 +12,14 @@ import pytest
 
 from pnv_cli.main import main
 from pnv_core.config import Config
+from pnv_core.decide.judge import Judge
 from pnv_core.describe.describer import Describer, load_describer
 from pnv_core.describe.download import DEFAULT_MODEL
 from pnv_core.describe.model_files import Model
 from pnv_core.errors import ConfigError
+from pnv_core.images import read_image
 from pnv_core.settings import settings_of
-from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.types import ImageRef, PatchGrid, PlaceDescriptor
 from pnv_core.verify.reranker import Reranker
 from pnv_lab.evaluation.datasets import open_dataset
 from pnv_lab.evaluation.datasets.dataset import Dataset
@@ -79,6 +81,20 @@ def test_every_method_finds_the_plain_revisits(dataset: Dataset, tmp_path: Path)
     assert answers([named]) == answers([by_name["multi-ransac"]])
     assert by_name["multi-ransac:16"].reference_bytes < by_name["multi-ransac"].reference_bytes
     assert by_name["netvlad"].reference_bytes == 4 * load_describer().model.global_dim
+
+
+@pytest.mark.parametrize("preset", ["default", "speed"])
+def test_the_configured_method_orders_as_the_recogniser_does(dataset: Dataset, tmp_path: Path, preset: str) -> None:
+    config = SMALL.replace(preset=preset, verify=0)
+    (result,) = Evaluation(config, tmp_path, silent).run(dataset, parse_methods("patchnetvlad"))
+    describer = Describer(load_describer().model, config)
+    judge = Judge(describer.config, describer.model.info.calibration)
+    described = [describer.describe(read_image(p)) for p in dataset.references]
+    for path, ranking in zip(dataset.queries, result.rankings, strict=True):
+        query = describer.describe(read_image(path))
+        found = [(ImageRef(i, 0, ""), float(query.global_vector @ d.global_vector)) for i, d in enumerate(described)]
+        judged = judge.judge(ImageRef(-1, 0, ""), query, 1.0, found, described, describer.config)
+        assert [c.match.id for c in judged] == ranking.references.tolist()
 
 
 def test_an_interrupted_evaluation_goes_on_to_the_same_result(dataset: Dataset, tmp_path: Path) -> None:
