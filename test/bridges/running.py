@@ -15,7 +15,7 @@ from msg_adapters.relative_pose import relative_pose_to_message
 from pnv_core.pose.geometry import RelativePose
 from pnv_core.types import ImageRef, LoopClosure
 from pnv_ros.outputs import CLOSURES_QOS
-from test.ros.processes import Listener, Process, ros_arguments, wait_until
+from test.ros.processes import NODE, Listener, Process, ros_arguments, wait_until
 
 S = 1_000_000_000
 METRIC = RelativePose(np.eye(3), np.array([0.0, 0.0, 1.0]), True, 30, np.diag([0.01] * 3 + [0.001] * 3))  # 1 m ahead
@@ -41,14 +41,15 @@ def closure(query_ns: int, match_ns: int, query_id: int = 1, match_id: int = 0, 
 class Recogniser:
     """The topics of place_recognizer, spoken by the test."""
 
-    def __init__(self, listener: Listener, node: str = "/place_recognizer") -> None:
+    def __init__(self, listener: Listener, bridge: str, node: str = NODE) -> None:
         from geometry_msgs.msg import PoseWithCovarianceStamped
 
         self.closures = listener.node.create_publisher(Float64MultiArray, "/loop_closures", CLOSURES_QOS)
         self.poses = listener.node.create_publisher(PoseWithCovarianceStamped, f"{node}/relative_pose", 50)
         wait_until(
-            lambda: self.closures.get_subscription_count() and self.poses.get_subscription_count(), 20, "a bridge"
+            lambda: self.closures.get_subscription_count() and self.poses.get_subscription_count(), 60, "a bridge"
         )
+        listener.met_by(bridge)
 
     def say(self, one: LoopClosure, pose: RelativePose | None = METRIC) -> None:
         self.closures.publish(closures_to_message([one], ["c"]))

@@ -62,17 +62,17 @@ class RtabMap:
 
 def test_rtabmap_gets_links_between_its_nodes_and_its_silent_refusals_are_said(listener):
     with running("rtabmap_bridge", READY) as bridge:
-        recogniser = Recogniser(listener)
+        recogniser = Recogniser(listener, "/rtabmap_bridge")
         recogniser.say(closure(150 * S, 110 * S))  # before RTAB-Map is there
         twin = RtabMap(listener.node, range(1, 60))
-        wait_until(lambda: len(twin.links) == 1, 30, "the first link")
+        wait_until(lambda: len(twin.links) == 1, 60, "the first link")
         link = twin.links[0]
         assert (link.from_id, link.to_id, link.type) == (10, 50, 4)
         np.testing.assert_allclose(matrix_of_transform(link.transform)[:3, 3], AHEAD, atol=1e-6)
         assert np.reshape(link.information, (6, 6))[0, 0] == pytest.approx(100.0)
 
         recogniser.say(closure(round(152.4 * S), 112 * S))  # 0.4 s beside a node, at 0.5 m/s: 0.2 m more
-        wait_until(lambda: len(twin.links) == 2, 30, "the second link")
+        wait_until(lambda: len(twin.links) == 2, 60, "the second link")
         assert np.reshape(twin.links[1].information, (6, 6))[0, 0] == pytest.approx(1 / (0.01 + 0.2**2))
 
         twin.memory.discard(20)  # transferred to long term memory
@@ -95,9 +95,9 @@ def test_rtabmap_gets_links_between_its_nodes_and_its_silent_refusals_are_said(l
         bridge.wait_for("RTAB-Map was restarted")
         recogniser.say(closure(940 * S, 900 * S))
         twin.publish(2)
-        wait_until(lambda: len(twin.links) == 3, 30, "a link in the new graph")
+        wait_until(lambda: len(twin.links) == 3, 60, "a link in the new graph")
         assert (twin.links[2].from_id, twin.links[2].to_id) == (1, 2)
-        wait_until(lambda: len(twin.asked) == 5, 5, "every request")
+        wait_until(lambda: len(twin.asked) == 5, 60, "every request")
         assert bridge.end(signal.SIGINT) == 0
     assert "Traceback" not in bridge.output
     assert "5 sent, 1 without a measured pose, 0 poses without a usable covariance, 1 without a node" in bridge.output
@@ -112,11 +112,11 @@ def test_hydra_gets_edges_from_the_query_to_the_match(listener):
     nodes = {i: i * S for i in range(1, 60)}  # of the agent's layer
     remap = ("-r", "external_loop_closures:=/hydra/external_loop_closures")
     with running("hydra_bridge", READY, *remap, robot_id=2) as bridge:
-        recogniser = Recogniser(listener)
+        recogniser = Recogniser(listener, "/hydra_bridge")
         for i in range(40, 50):
             recogniser.say(closure(i * S + 200_000_000, (i - 30) * S))
         recogniser.say(closure(55 * S, 5 * S), None)
-        wait_until(lambda: len(graphs) == 10, 30, "every edge")
+        wait_until(lambda: len(graphs) == 10, 60, "every edge")
         assert bridge.end() == 0
     inserted = []
     for edge in (edge for graph in graphs for edge in graph.edges):
@@ -133,24 +133,24 @@ def test_covariances_that_are_none_and_a_restart_of_either_side_are_said_and_los
 
     graphs = listener.collect(PoseGraph, "/external_loop_closures", 100)
     with running("hydra_bridge", READY) as bridge:
-        recogniser = Recogniser(listener)
+        recogniser = Recogniser(listener, "/hydra_bridge")
         for query, wrong in ((40, np.nan), (41, np.inf), (42, -1.0)):
             pose = type(METRIC)(METRIC.rotation, METRIC.translation, True, 30, np.diag([wrong] * 6))
             recogniser.say(closure(query * S, 10 * S), pose)
         bridge.wait_for("relative pose of 40.000 has no finite, positive covariance; passed over")
         recogniser.say(closure(43 * S, 13 * S))
-        wait_until(lambda: len(graphs) == 1, 30, "the edge with a covariance")
+        wait_until(lambda: len(graphs) == 1, 60, "the edge with a covariance")
         for publisher in (recogniser.closures, recogniser.poses):
             listener.node.destroy_publisher(publisher)
-        restarted = Recogniser(listener)
+        restarted = Recogniser(listener, "/hydra_bridge")
         restarted.say(closure(44 * S, 14 * S))
-        wait_until(lambda: len(graphs) == 2, 30, "an edge of the recogniser that was restarted")
+        wait_until(lambda: len(graphs) == 2, 60, "an edge of the recogniser that was restarted")
         assert bridge.end(signal.SIGTERM) == 0
     assert "Traceback" not in bridge.output
     assert "ended: 2 sent, 3 without a measured pose, 3 poses without a usable covariance" in bridge.output
     with running("hydra_bridge", READY) as bridge:  # gets the closures again that are kept for it, their poses not
-        Recogniser(listener).say(closure(45 * S, 15 * S))
-        wait_until(lambda: len(graphs) == 3, 30, "an edge of the bridge that was restarted")
+        Recogniser(listener, "/hydra_bridge").say(closure(45 * S, 15 * S))
+        wait_until(lambda: len(graphs) == 3, 60, "an edge of the bridge that was restarted")
         assert bridge.end() == 0
     assert [edge.key_from for graph in graphs for edge in graph.edges] == [43 * S, 44 * S, 45 * S]
 
@@ -162,17 +162,17 @@ def test_swarm_slam_gets_closures_between_its_keyframes(listener):
     received = listener.collect(IntraRobotLoopClosure, "/cslam/intra_robot_loop_closure", 100)
     keyframes = listener.node.create_publisher(KeyframeOdom, "/cslam/keyframe_odom", 100)
     with running("swarm_slam_bridge", READY) as bridge:
-        recogniser = Recogniser(listener)
-        wait_until(keyframes.get_subscription_count, 20, "the bridge")
+        recogniser = Recogniser(listener, "/swarm_slam_bridge")
+        wait_until(keyframes.get_subscription_count, 60, "the bridge")
         for i in range(50):
             keyframes.publish(KeyframeOdom(id=i, odom=odometry_message((1000 + 2 * i) * S, np.eye(4))))
         for i in range(30, 40):
             recogniser.say(closure((1000 + 2 * i) * S, (1000 + 2 * (i - 20)) * S))
         recogniser.say(closure(1080 * S, 1001 * S))  # between two keyframes, a second from both
         recogniser.say(closure(1200 * S, 1020 * S))  # its keyframe comes later
-        wait_until(lambda: len(received) == 10, 30, "every closure")
+        wait_until(lambda: len(received) == 10, 60, "every closure")
         keyframes.publish(KeyframeOdom(id=50, odom=odometry_message(1200 * S, np.eye(4))))
-        wait_until(lambda: len(received) == 11, 30, "the closure that waited")
+        wait_until(lambda: len(received) == 11, 60, "the closure that waited")
         keyframes.publish(KeyframeOdom(id=3, odom=odometry_message(5 * S, np.eye(4))))
         bridge.wait_for("Swarm-SLAM was restarted")
         assert bridge.end() == 0
@@ -188,7 +188,8 @@ def test_lio_sam_gets_the_last_pairs_once_it_listens(listener):
     """LIO-SAM, src/mapOptmization.cpp: two doubles, newer and older in seconds; a queue of the last five."""
     pairs = listener.node.create_publisher(Float64MultiArray, "/place_recognizer/lio_sam", TABLE_QOS)
     with running("lio_sam_bridge", "hands on /place_recognizer/lio_sam to /lio_loop/loop_closure_detection") as bridge:
-        wait_until(pairs.get_subscription_count, 20, "the bridge")
+        wait_until(pairs.get_subscription_count, 60, "the bridge")
+        listener.met_by("/lio_sam_bridge")
         for i in range(7):
             pairs.publish(Float64MultiArray(data=[100.0 + i, float(i)]))
         bridge.wait_for("nobody listens on /lio_loop/loop_closure_detection; the last 5 closures are kept")
@@ -196,9 +197,9 @@ def test_lio_sam_gets_the_last_pairs_once_it_listens(listener):
             pairs.publish(Float64MultiArray(data=wrong))
         bridge.wait_for("allowed: two stamps in seconds, the newer first")
         received = listener.collect(Float64MultiArray, "/lio_loop/loop_closure_detection", TABLE_QOS)
-        wait_until(lambda: len(received) == 5, 30, "what was kept")
+        wait_until(lambda: len(received) == 5, 60, "what was kept")
         pairs.publish(Float64MultiArray(data=[200.0, 50.0]))
-        wait_until(lambda: len(received) == 6, 30, "a pair while LIO-SAM listens")
+        wait_until(lambda: len(received) == 6, 60, "a pair while LIO-SAM listens")
         assert bridge.end() == 0
     assert [list(m.data) for m in received] == [*([100.0 + i, float(i)] for i in range(2, 7)), [200.0, 50.0]]
     assert "ended: 6 sent, 2 without a listener, 3 malformed" in bridge.output

@@ -29,7 +29,7 @@ def test_one_node_recognises_where_another_was(server, tmp_path):
                         camera.send(image(scene(number), (EPOCH_S + start_s + second) * SECOND))
                     sent = len(scenes)
                     wait_until(lambda h=health, n=sent: h.count("fleet: keyframes sent") == n, 60, "the store")
-            wait_until(lambda: heard, 30, "a closure")
+            wait_until(lambda: heard, 60, "a closure")
         finally:
             listener.close()
     (closure,) = closures_from_message(heard[0])

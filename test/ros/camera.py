@@ -9,7 +9,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
-from test.ros.processes import Listener, wait_until
+from test.ros.processes import NODE, PATIENCE_S, Listener, wait_until
 
 EPOCH_S = 1_700_000_000
 RELIABLE = QoSProfile(depth=10, reliability=QoSReliabilityPolicy.RELIABLE)
@@ -51,29 +51,35 @@ class Camera:
     def __init__(self, listener: Listener, health: "Health", topic: str, kind: type = Image, qos: Any = RELIABLE):
         self._publisher = listener.node.create_publisher(kind, topic, qos)
         self._health = health
-        wait_until(self._publisher.get_subscription_count, 60, f"a subscription of {topic}")
+        wait_until(self._publisher.get_subscription_count, PATIENCE_S, f"a subscription of {topic}")
+        listener.met_by(health.node)
 
     def send(self, message: Any, wait: bool = True) -> None:
         before = self._health.dealt_with()
         self._publisher.publish(message)
         if wait:
-            wait_until(lambda: self._health.dealt_with() > before, 60, "the node to take a frame")
+            wait_until(lambda: self._health.dealt_with() > before, PATIENCE_S, "the node to take a frame")
+
+
+def dealt_with(values: dict[str, str]) -> int:
+    """Frames processed or dropped, of the values of one status."""
+    return sum(int(v) for k, v in values.items() if k == "frames processed" or k.startswith("dropped"))
 
 
 class Health:
     """/diagnostics of one node."""
 
-    def __init__(self, listener: Listener, node: str = "/place_recognizer"):
+    def __init__(self, listener: Listener, node: str = NODE):
         self._messages = listener.collect(DiagnosticArray, "/diagnostics")
-        self._node = node
+        self.node = node
 
     @property
     def status(self) -> Any:
         """The latest status."""
-        return wait_until(self._latest, 60, "diagnostics")
+        return wait_until(self._latest, PATIENCE_S, "diagnostics")
 
     def _latest(self) -> Any:
-        return next((s for m in reversed(self._messages) for s in m.status if s.hardware_id == self._node), None)
+        return next((s for m in reversed(self._messages) for s in m.status if s.hardware_id == self.node), None)
 
     def values(self) -> dict[str, str]:
         return {v.key: v.value for v in self.status.values}
@@ -87,11 +93,10 @@ class Health:
 
     def dealt_with(self) -> int:
         """Frames processed or dropped."""
-        values = self.values()
-        return sum(int(v) for k, v in values.items() if k == "frames processed" or k.startswith("dropped"))
+        return dealt_with(self.values())
 
     def fresh(self) -> Any:
         """A status published from now on."""
         seen = len(self._messages)
-        wait_until(lambda: len(self._messages) > seen + 1, 60, "fresh diagnostics")
+        wait_until(lambda: len(self._messages) > seen + 1, PATIENCE_S, "fresh diagnostics")
         return self.status

@@ -12,16 +12,15 @@ import zlib
 from array import array
 
 import cv2
-import rclpy
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from sensor_msgs.msg import CompressedImage, Image
 
 from msg_adapters.images import ENCODINGS
-from test.ros.camera import EPOCH_S, RELIABLE, compressed, image, scene
+from test.ros.camera import EPOCH_S, RELIABLE, Health, compressed, image, scene
+from test.ros.processes import NODE, PATIENCE_S, Listener, wait_until
 
 PACE_S = 0.002  # the node unpacks and refuses one in less
-GOOD_PACE_S = 0.6  # and recognises one in less
 
 
 def png_claiming(width: int, height: int) -> bytes:
@@ -76,25 +75,28 @@ def main() -> int:
     parser.add_argument("--good-every", type=int, default=50)
     parser.add_argument("--begin", type=int, default=EPOCH_S, help="seconds of the first stamp")
     args = parser.parse_args()
-    rclpy.init()
-    node = rclpy.create_node("broken_camera")
+    camera = Listener("broken_camera")
     publishers = {
-        Image: node.create_publisher(Image, "raw", RELIABLE),
-        CompressedImage: node.create_publisher(CompressedImage, "packed/compressed", RELIABLE),
+        Image: camera.node.create_publisher(Image, "raw", RELIABLE),
+        CompressedImage: camera.node.create_publisher(CompressedImage, "packed/compressed", RELIABLE),
     }
-    while not all(p.get_subscription_count() for p in publishers.values()):
-        time.sleep(0.05)
-    time.sleep(0.5)
-    stamp_ns, offered, good = args.begin * 10**9, 0, 0
+    for publisher in publishers.values():
+        wait_until(publisher.get_subscription_count, PATIENCE_S, "a listener")
+    camera.met_by(NODE)
+    stamp_ns, offered, good, health = args.begin * 10**9, 0, 0, Health(camera)
+    before = health.dealt_with()
+
+    def settled() -> None:
+        wait_until(lambda: health.dealt_with() - before >= offered + good, PATIENCE_S, "the node to deal with them all")
 
     def good_ones() -> None:
         nonlocal stamp_ns, good
-        time.sleep(GOOD_PACE_S)  # nothing waits in the slot
+        settled()  # nothing waits in the slot
         for make, kind in ((image, Image), (compressed, CompressedImage)):
             stamp_ns += 10**9
             publishers[kind].publish(make(scene(good), stamp_ns))
-            time.sleep(GOOD_PACE_S)
             good += 1
+            settled()
 
     @settings(max_examples=args.count, deadline=None, database=None, phases=[Phase.generate],
               suppress_health_check=list(HealthCheck))  # fmt: skip
@@ -117,7 +119,7 @@ def main() -> int:
 
     offer()
     good_ones()
-    time.sleep(1.0)
+    camera.close()
     print(f"offered {offered} malformed and {good} good")
     return 0
 

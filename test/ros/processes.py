@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 ROOT = Path(__file__).resolve().parents[2]
 NODE = "/place_recognizer"
+PATIENCE_S = 120.0  # of what comes at once on an idle machine
 
 
 @contextmanager
@@ -71,7 +73,7 @@ class Process:
     def output(self) -> str:
         return "\n".join(self.lines)
 
-    def wait_for(self, words: str, timeout: float = 60.0, meanwhile: Callable[[], Any] = lambda: None) -> str:
+    def wait_for(self, words: str, timeout: float = PATIENCE_S, meanwhile: Callable[[], Any] = lambda: None) -> str:
         """The first line with these words. Fails if the process ends or says nothing of the kind.
 
         `meanwhile` sends, again and again: a publisher may know the process before the process knows it, and what is
@@ -90,13 +92,13 @@ class Process:
             time.sleep(0.02)
         raise AssertionError(f"no {words!r} within {timeout} s:\n{self.output}")
 
-    def end(self, number: int = signal.SIGINT, timeout: float = 30.0) -> int:
+    def end(self, number: int = signal.SIGINT, timeout: float = PATIENCE_S) -> int:
         """Send the signal and give the exit status."""
         if self.child.poll() is None:
             self.child.send_signal(number)
         return self.wait(timeout)
 
-    def wait(self, timeout: float = 60.0) -> int:
+    def wait(self, timeout: float = PATIENCE_S) -> int:
         try:
             status = self.child.wait(timeout)
         except subprocess.TimeoutExpired:
@@ -156,10 +158,10 @@ def publisher(*arguments: str) -> Process:
 class Listener:
     """An rclpy node of the test process, spun in a thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = "listener") -> None:
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
-        self.node = Node("listener", context=self.context)
+        self.node = Node(name, context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
         self._executor.add_node(self.node)
         self._stop = threading.Event()
@@ -176,10 +178,30 @@ class Listener:
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
 
-    def call(self, kind: type, name: str, request: Any, timeout: float = 30.0) -> Any:
-        """The answer of a service."""
+    def met_by(self, node: str) -> None:
+        """Wait until a node knows every publisher, subscription and client that this one has.
+
+        Each side learns of the other at a moment of its own, and what is sent between the two is lost. Discovery names
+        endpoints in the order of their making: a node that answers a client made last knows those made before. It is
+        asked again and again, since the answers are lost until then.
+        """
+        client, asked = self.node.create_client(GetParameters, f"{node}/get_parameters"), []
+        assert client.wait_for_service(PATIENCE_S), f"no node {node}"
+
+        def answered() -> bool:
+            if len(asked) <= time.monotonic() - begin:  # once a second
+                asked.append(client.call_async(GetParameters.Request()))
+            return any(future.done() for future in asked)
+
+        begin = time.monotonic()
+        wait_until(answered, PATIENCE_S, f"an answer of {node}")
+        self.node.destroy_client(client)
+
+    def call(self, kind: type, name: str, request: Any, timeout: float = PATIENCE_S) -> Any:
+        """The answer of a service of a node, NODE/SERVICE."""
         client = self.node.create_client(kind, name)
         assert client.wait_for_service(timeout), f"no service {name}"
+        self.met_by(name.rpartition("/")[0])
         future = client.call_async(request)
         wait_until(future.done, timeout, f"an answer of {name}")
         self.node.destroy_client(client)

@@ -12,9 +12,10 @@ from array import array
 
 import cv2
 import numpy as np
-import rclpy
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
+
+from test.ros.processes import NODE, PATIENCE_S, Listener, wait_until
 
 ENCODINGS = {
     "bgr8": lambda bgr: bgr,
@@ -47,19 +48,14 @@ def main() -> int:
     parser.add_argument("--linger", type=float, default=1.0)
     args = parser.parse_args()
 
-    rclpy.init()
-    node = rclpy.create_node("camera_driver")
+    driver = Listener("camera_driver")
     reliability = QoSReliabilityPolicy.RELIABLE if args.reliable else QoSReliabilityPolicy.BEST_EFFORT
     kind = Image if args.encoding in ENCODINGS else CompressedImage
     qos = QoSProfile(depth=5, reliability=reliability)
-    publishers = [node.create_publisher(kind, topic, qos) for topic in args.topic.split(",")]
-    give_up = time.monotonic() + 30
-    while not all(publisher.get_subscription_count() for publisher in publishers):
-        if time.monotonic() > give_up:
-            print("nobody listens", file=sys.stderr)
-            return 1
-        time.sleep(0.02)
-    time.sleep(0.3)  # the other side may know of this one a little later
+    publishers = [driver.node.create_publisher(kind, topic, qos) for topic in args.topic.split(",")]
+    for publisher in publishers:
+        wait_until(publisher.get_subscription_count, PATIENCE_S, "a listener")
+    driver.met_by(NODE)
 
     width, height = (int(v) for v in args.size.split("x"))
     with open(args.stamps, newline="") as file:
@@ -76,6 +72,7 @@ def main() -> int:
         due += 1.0 / args.rate
         time.sleep(max(0.0, due - time.monotonic()))
     time.sleep(args.linger)
+    driver.close()
     print(f"published {len(rows)}")
     return 0
 

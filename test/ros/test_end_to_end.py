@@ -12,7 +12,7 @@ from std_msgs.msg import Float64MultiArray
 from msg_adapters.loop_closures import closures_from_message
 from msg_adapters.typed_closures import closures_from_typed, typed_type
 from pnv_ros.outputs import CLOSURES_QOS
-from test.ros.processes import publisher, running_node, wait_until
+from test.ros.processes import NODE, publisher, running_node, wait_until
 from test.ros.tables import rows_of
 
 pytestmark = pytest.mark.process
@@ -47,13 +47,14 @@ def test_closures_of_a_robot_driving_laps_arrive_with_the_stamps_of_its_images(s
     typed = listener.collect(typed_type(), "/place_recognizer/closures", CLOSURES_QOS) if typed_type() else None
     every_frame = {"min_interval_s": 0.0, "min_change": 0.0}
     with running_node(exclude_recent_s=10, accept_score=0.0, consistency=0, **every_frame, **RELIABLE) as node:
+        listener.met_by(NODE)
         assert publisher("--reliable", "--stamps", table, "--rate", "4").wait() == 0
         wait_until(lambda: len(arrived) >= 5, 60, "closures")
         assert node.end(signal.SIGINT) == 0
         assert "Traceback" not in node.output
 
     if typed is not None:
-        wait_until(lambda: len(typed) == len(arrived), 10, "the typed twin")
+        wait_until(lambda: len(typed) == len(arrived), 60, "the typed twin")
         twins = [closures_from_message(m, ["camera/image_raw"]) for m in arrived]
         assert [[(c.query, c.match) for c in closures_from_typed(m)] for m in typed] == [
             [(c.query, c.match) for c in closures] for closures in twins
@@ -85,9 +86,10 @@ def test_at_the_default_settings_a_second_lap_is_recognised_and_nothing_wrong_is
 
     arrived = listener.collect(Float64MultiArray, "/loop_closures", CLOSURES_QOS)
     with running_node(exclude_recent_s=10, **RELIABLE) as node:
+        listener.met_by(NODE)
         assert publisher("--reliable", "--stamps", table, "--rate", "5", "--linger", "3").wait() == 0
-        wait_until(lambda: arrived, 30, "a closure")
-        line = node.wait_for("loop closed", 30)
+        wait_until(lambda: arrived, 60, "a closure")
+        line = node.wait_for("loop closed")
         assert re.search(r"loop closed: \d+\.\d+ \(camera.*\) matches \d+\.\d+ .*score 0\.\d{3}", line)
         assert node.end(signal.SIGINT) == 0
 
@@ -107,6 +109,7 @@ def test_the_end_of_a_campus_loop_is_recognised_as_its_beginning(shared, tmp_pat
 
     tables = listener.collect(PointCloud2, "/place_recognizer/candidates")
     with running_node(min_change=0.0, **RELIABLE) as node:
+        listener.met_by(NODE)
         assert publisher("--reliable", "--stamps", table, "--rate", "2", "--encoding", "png").wait() == 0
         wait_until(lambda: tables and rows_of(tables[-1])[0]["query_sec"] == max(stamps) // 10**9, 60, "the last frame")
         assert node.end(signal.SIGTERM) == 0
@@ -123,6 +126,7 @@ def test_a_compressed_and_a_16_bit_camera_give_closures_alike(shared, tmp_path, 
     for encoding in ("mono16", "png"):
         tables = listener.collect(PointCloud2, "/place_recognizer/candidates")
         with running_node(min_change=0.0, **RELIABLE) as node:
+            listener.met_by(NODE)
             assert publisher("--reliable", "--stamps", table, "--rate", "4", "--encoding", encoding).wait() == 0
             wait_until(lambda found=tables: found and rows_of(found[-1])[0]["query_nsec"] == 9, 60, "the last frame")
             assert node.end() == 0

@@ -71,11 +71,11 @@ def test_a_signal_while_the_node_starts_ends_it_without_a_traceback(domain):
 def test_a_soak_whose_node_is_killed_leaves_its_plot_and_does_not_abort(tmp_path):
     soak = Process(sys.executable, "-m", "test.ros.soak", "--seconds", "20", "--output", str(tmp_path / "soak.png"))
     table = tmp_path / "soak.csv"
-    wait_until(lambda: table.exists() and len(table.read_text().splitlines()) > 2, 90, "two samples")
+    wait_until(lambda: table.exists() and len(table.read_text().splitlines()) > 2, 120, "two samples")
     children = Path(f"/proc/{soak.child.pid}/task/{soak.child.pid}/children").read_text().split()
     for child in children:
         if "place_recognizer" in Path(f"/proc/{child}/cmdline").read_text():
             os.kill(int(child), signal.SIGKILL)
-    assert soak.wait(90) == 1
+    assert soak.wait() == 1
     assert "terminate called" not in soak.output
     assert (tmp_path / "soak.png").stat().st_size > 10_000

@@ -151,13 +151,13 @@ def test_callbacks_are_served_while_a_map_is_saved_and_the_answer_comes_then(dom
         client = listener.node.create_client(Trigger, "/place_recognizer/save")
         assert client.wait_for_service(30)
         answer = client.call_async(Trigger.Request())
-        wait_until(lambda: ticks.count(False) > 10, 30, "callbacks beside a save")
+        wait_until(lambda: ticks.count(False) > 10, 60, "callbacks beside a save")
         assert not answer.done()
         ended.set()  # the process is to end: the call in hand is answered first
         time.sleep(0.1)
         assert thread.is_alive()
         controls.end.set()
-        wait_until(answer.done, 30, "the answer")
+        wait_until(answer.done, 60, "the answer")
         assert (answer.result().success, answer.result().message) == (True, "saved")
     finally:
         controls.end.set()

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.process
 
 
 def fetched(url: str) -> bytes:
-    with urllib.request.urlopen(url, timeout=10) as answer:
+    with urllib.request.urlopen(url, timeout=60) as answer:
         return answer.read()
 
 
@@ -33,7 +33,7 @@ def test_the_page_shows_scores_health_and_the_match_of_a_running_node(domain, tm
     table = write_stamps(tmp_path / "stamps.csv", stamps)
     watch = Process(sys.executable, "-m", "pnv_ros.watch", "--port", "0")
     try:
-        url = watch.wait_for("http://127.0.0.1:", 60).strip()
+        url = watch.wait_for("http://127.0.0.1:").strip()
         assert b"<canvas" in fetched(url)
         with pytest.raises(urllib.error.HTTPError):
             fetched(f"{url}/etc/passwd")
@@ -42,7 +42,7 @@ def test_the_page_shows_scores_health_and_the_match_of_a_running_node(domain, tm
             wait_until(lambda: "accept_score" in json.loads(fetched(f"{url}/state.json"))["values"], 60, "its health")
             assert publisher("--reliable", "--stamps", table, "--rate", "2", "--linger", "3").wait() == 0
             wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["queries"]) >= 3, 60, "queries on the page")
-            wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["map"]["keyframes"]) >= 3, 30, "a map")
+            wait_until(lambda: len(json.loads(fetched(f"{url}/state.json"))["map"]["keyframes"]) >= 3, 60, "a map")
             state = json.loads(fetched(f"{url}/state.json"))
             picture = cv2.imdecode(np.frombuffer(fetched(f"{url}/match.jpg"), np.uint8), cv2.IMREAD_COLOR)
         assert picture.std() > 10
