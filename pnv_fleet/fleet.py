@@ -139,7 +139,7 @@ class Fleet:
         self._lanes = {lane: Answers(config, calibration, like) for lane in _LANES}
         self._closures, self._say = closures, say
         self._outbox = Outbox(options.outbox, options.outbox_mb)
-        self._store: PlaceStore | None = None
+        self._stores: dict[str, PlaceStore] = {}  # each lane its own: what one closes the other may use
         self._sessions: dict[int, int] = {}
         self._offered: deque[tuple[Query, int, tuple[float, float, float] | None, float]] = deque()
         self._fresh: deque[_Asked] = deque()
@@ -149,7 +149,7 @@ class Fleet:
         self._ended = threading.Event()
         self._troubles: dict[str, tuple[str, float]] = {}  # of the outbox and the lanes: what, since when
         self._pause_s, self._again = dict.fromkeys(_LANES, 0.0), dict.fromkeys(_LANES, 0.0)
-        self._opened = ""
+        self._told = ""  # what the store is
         self._counts: Counter[str] = Counter()
         self._robots: Counter[str] = Counter()
         self._owed = 0.0  # bytes beyond the limit
@@ -206,9 +206,8 @@ class Fleet:
             self._changed.notify_all()
         for thread in self._threads:  # one that waits for a silent store is left behind
             thread.join(timeout=_CLOSE_S)
-        if self._store is not None:
-            with suppress(FleetError):
-                self._store.close()
+        for lane in _LANES:
+            self._disconnect(lane)
         self._outbox.close()
 
     # keep
@@ -401,38 +400,39 @@ class Fleet:
     # The store's state
 
     def _connected(self, lane: str) -> PlaceStore | None:
-        """The store; None while the lane leaves it alone after a failure. Raises FleetError."""
-        with self._connecting:
-            if time.monotonic() < self._again[lane]:
-                return None
-            if self._store is None:
-                timeout_s = max(_TIMEOUT_S, 4e-3 * self.options.budget_ms)
-                store = PlaceStore(
-                    self.options.uri,
-                    self._fingerprint,
-                    self._access,
-                    len(self._like.global_vector),
-                    self._parts,
-                    timeout_s,
-                )
-                told = f"fleet: {self.options.uri} ({store.version()}), collection {store.collection}"
-                if store.others:
-                    told += f"; {len(store.others)} other models, which cannot be compared"
-                if told != self._opened:
-                    self._say(told)
-                self._store, self._opened = store, told
-            return self._store
+        """The lane's store; None while the lane leaves it alone after a failure. Raises FleetError."""
+        if time.monotonic() < self._again[lane]:
+            return None
+        store = self._stores.get(lane)
+        if store is None:
+            with self._connecting:  # one after the other: the first may have to make the collection
+                store = self._stores[lane] = self._opened()
+        return store
+
+    def _opened(self) -> PlaceStore:
+        timeout_s = max(_TIMEOUT_S, 4e-3 * self.options.budget_ms)
+        dim = len(self._like.global_vector)
+        store = PlaceStore(self.options.uri, self._fingerprint, self._access, dim, self._parts, timeout_s)
+        told = f"fleet: {self.options.uri} ({store.version()}), collection {store.collection}"
+        if store.others:
+            told += f"; {len(store.others)} other models, which cannot be compared"
+        if told != self._told:
+            self._say(told)
+        self._told = told
+        return store
+
+    def _disconnect(self, lane: str) -> None:
+        store = self._stores.pop(lane, None)
+        if store is not None:
+            with suppress(FleetError):
+                store.close()
 
     def _fail(self, lane: str, problem: str) -> None:
         """The store failed a lane, which leaves it alone for a while, longer each time; a full one still answers."""
         self._trouble(lane, problem)
-        with self._connecting:
-            self._pause_s[lane] = min(_LONGEST_PAUSE_S, max(1.0, 2 * self._pause_s[lane]))
-            self._again[lane] = time.monotonic() + self._pause_s[lane]
-            if self._store is not None:
-                with suppress(FleetError):
-                    self._store.close()
-            self._store = None
+        self._pause_s[lane] = min(_LONGEST_PAUSE_S, max(1.0, 2 * self._pause_s[lane]))
+        self._again[lane] = time.monotonic() + self._pause_s[lane]
+        self._disconnect(lane)
 
     def _trouble(self, part: str, problem: str) -> None:
         if self._ended.is_set():  # the outbox was closed under a thread that was left behind

@@ -1,6 +1,7 @@
 """A robot's part in the fleet: real threads, a real store, stores that are slow, silent, gone and back."""
 
 import socket
+import threading
 import time
 from dataclasses import replace
 
@@ -108,10 +109,9 @@ def test_a_store_that_is_away_loses_nothing_and_its_answers_come_late(server, tm
     alpha.settled()
     alpha.fleet.close()
     beta = Robot(tmp_path, "beta", f"http://127.0.0.1:{port}", alpha.model, start_s=5000, budget_ms=300.0)
-    start = time.monotonic()
-    local = beta.see(2, 50, 3)
-    assert time.monotonic() - start < 3.0
-    wait_until(lambda: beta.status.problem and beta.status.waiting == 3, 30, "a problem")
+    local = beta.see(2, 50, 3)  # does not wait for what cannot be sent
+    assert beta.status.sent == 0
+    wait_until(lambda: beta.status.problem and beta.status.waiting == 3, 60, "a problem")
     assert "cannot be reached" in beta.status.sentence()
     assert "since" in beta.status.sentence()
     beta.fleet.close()
@@ -146,16 +146,56 @@ def test_a_store_that_answers_but_has_no_room_is_one_line(server, tmp_path, monk
     alpha.lines.clear()
     for number in range(10, 14):
         alpha.see(number)
-        wait_until(lambda n=number: alpha.status.asked + alpha.status.late >= n - 6, 30, "an answer")
-        wait_until(lambda: "no room" in alpha.status.sentence(), 30, "a problem")
+        wait_until(lambda n=number: alpha.status.asked + alpha.status.late >= n - 6, 60, "an answer")
+        wait_until(lambda: "no room" in alpha.status.sentence(), 60, "a problem")
         time.sleep(0.5)
     assert alpha.lines == [f"fleet: {server.uri}: the store has no room"]
     full = False
     alpha.settled()
-    wait_until(lambda: not alpha.status.problem, 30, "an end of it")
+    wait_until(lambda: not alpha.status.problem, 60, "an end of it")
     assert alpha.lines[1].startswith("fleet: well again after")
     assert len(alpha.lines) == 2
     alpha.fleet.close()
+
+
+@pytest.mark.parametrize("kind", ["served", "file"])
+def test_a_failing_upload_leaves_the_query_in_hand_alone(server, tmp_path, monkeypatch, kind):
+    uri = server.uri if kind == "served" else str(tmp_path / "places.db")
+    alpha = Robot(tmp_path, "alpha", uri)
+    alpha.see(1, 2, 3)
+    alpha.settled()
+    alpha.fleet.close()
+    asking, closed = threading.Event(), threading.Event()
+    search, put, close = PlaceStore.search, PlaceStore.put, PlaceStore.close
+
+    def slow(store, vector, *more):
+        if beta.seen > 1:
+            asking.set()
+            assert closed.wait(60)  # the failed upload has given its store up
+        return search(store, vector, *more)
+
+    def refuse_once(store, places):
+        if not closed.is_set():
+            assert asking.wait(60)
+            raise FleetError(f"{store.uri}: the store has no room")
+        put(store, places)
+
+    def noted(store):
+        close(store)
+        closed.set()
+
+    beta = Robot(tmp_path, "beta", uri, alpha.model, start_s=5000, budget_ms=60_000.0)
+    for name, act in (("search", slow), ("put", refuse_once), ("close", noted)):
+        monkeypatch.setattr(PlaceStore, name, act)
+    beta.see(50)
+    wait_until(lambda: beta.status.asked == 1, 60, "the first answer")
+    beta.see(2)
+    wait_until(lambda: beta.status.asked == 2, 60, "the second answer")
+    assert [c.match.stamp_ns // SECOND for c in beta.accepted] == [1002]
+    assert beta.status.late == 0
+    beta.settled()
+    assert any("no room" in line for line in beta.lines)
+    beta.fleet.close()
 
 
 @pytest.mark.parametrize("uri", ["http://robot:secret@127.0.0.1:1", "places.sqlite"])
@@ -170,11 +210,10 @@ def test_the_recogniser_never_waits_for_a_store_that_never_answers(tmp_path):
         robot = Robot(tmp_path, "alpha", f"http://127.0.0.1:{silent.getsockname()[1]}")
         robot.see(*range(3))
         query = robot.recognizer.latest
-        start = time.monotonic()
         for _ in range(50):
             robot.fleet.offer(query, 0)
-        assert time.monotonic() - start < 0.5
-        wait_until(lambda: robot.status.waiting >= 3, 10, "the outbox")
+        assert not robot.status.problem  # handed over before the first call to the store ended, after 20 s
+        wait_until(lambda: robot.status.waiting >= 3, 60, "the outbox")
         robot.fleet.close()
 
 
@@ -185,7 +224,7 @@ def test_what_the_fleet_has_is_not_sent_again(server, tmp_path):
     beta = Robot(tmp_path, "beta", server.uri, alpha.model, start_s=5000, coverage=0.95)
     beta.see(1, 60, 2)
     beta.settled()
-    wait_until(lambda: beta.status.covered == 2, 20, "two covered")
+    wait_until(lambda: beta.status.covered == 2, 60, "two covered")
     assert beta.store(server.uri).count() == 5
     for robot in (alpha, beta):
         robot.fleet.close()
@@ -201,7 +240,7 @@ def test_places_of_long_ago_are_forgotten_but_not_those_of_others(server, tmp_pa
     other.settled()
     later = Robot(tmp_path, "alpha", server.uri, old.model, start_s=90_000, keep_days=1.0)  # 89,000 s later
     later.see(6)
-    wait_until(lambda: later.status.expired == 3, 30, "the old places to be forgotten")
+    wait_until(lambda: later.status.expired == 3, 60, "the old places to be forgotten")
     later.settled()
     assert sorted(p.robot for p in later.store(server.uri).scan()) == ["alpha", "beta", "beta"]
     assert any("forgot 3 places older than 1 days" in line for line in later.lines)
@@ -269,7 +308,7 @@ def test_a_query_that_is_no_keyframe_is_asked_and_not_stored(server, tmp_path):
 
     beta.recognizer.process(Frame(5000 * SECOND, "front", scene(1)))
     beta.fleet.offer(beta.recognizer.latest, 5000 * SECOND)
-    wait_until(lambda: beta.accepted, 20, "a closure")
+    wait_until(lambda: beta.accepted, 60, "a closure")
     assert beta.accepted[0].query.id == -1
     assert (beta.status.waiting, beta.store(server.uri).count()) == (0, 3)
     for robot in (alpha, beta):
