@@ -4,6 +4,7 @@ The response of add_link is empty, whether the link was kept or not; the bridge 
 what became of each link. One link is asked for at a time.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Any
@@ -36,6 +37,7 @@ class RtabmapBridge(MetricBridge):
         self._queue: deque[NodePair] = deque()
         self._asked: NodePair | None = None
         self._asked_at, self._knows_the_map, self._told = 0, False, False
+        self._map_asked_at = -math.inf
         self.taken, self.refused = 0, Counter[str]()
         self._add = self.create_client(self._types.AddLink, f"{config.rtabmap_node}/add_link")
         self._get = self.create_client(self._types.GetMap, f"{config.rtabmap_node}/get_map_data")
@@ -64,6 +66,10 @@ class RtabmapBridge(MetricBridge):
                 self._queue.clear()
             self._queue += self._ids.add_node(node, stamp_ns)
 
+    def _learn(self, graph: Any) -> None:
+        self._knows_the_map = True
+        self._map_data(graph)
+
     def _pump(self) -> None:
         """Learn the nodes there are, then ask for one link after the other."""
         ready = self._add.service_is_ready() and self._get.service_is_ready()
@@ -71,13 +77,13 @@ class RtabmapBridge(MetricBridge):
             if self._queue and not self._told:
                 self._told = True
                 self.get_logger().warning(f"no service {self._add.srv_name}; {len(self._queue)} links wait for it")
-            self._knows_the_map, self._asked = False, None
+            self._knows_the_map, self._map_asked_at, self._asked = False, -math.inf, None
             return
         self._told = False
-        if not self._knows_the_map:
-            self._knows_the_map = True
-            self._whole_graph(self._map_data)
         now = self.get_clock().now().nanoseconds
+        if not self._knows_the_map and now - self._map_asked_at > _ANSWER_S * 1e9:
+            self._map_asked_at = now  # the answer is lost where RTAB-Map does not know this client yet
+            self._whole_graph(self._learn)
         if self._asked is not None and now - self._asked_at > _ANSWER_S * 1e9:
             self._settle(f"no answer in {_ANSWER_S:.0f} s")
         if self._asked is None and self._queue:

@@ -5,6 +5,7 @@ The camera looks ahead from the body, so a query one metre ahead of its match is
 
 import signal
 import sys
+from itertools import count
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ class RtabMap:
     """rtabmap_slam/src/CoreWrapper.cpp and corelib/src/Rtabmap.cpp: nodes by id with stamps, add_link with an empty
     response, links dropped silently where a node is not in working memory or the graph error is too large."""
 
-    def __init__(self, node, ids, first_stamp_s=100):
+    def __init__(self, node, ids, first_stamp_s=100, lost=0):
         from rtabmap_msgs.msg import MapData
         from rtabmap_msgs.srv import AddLink, GetMap
 
@@ -37,6 +38,8 @@ class RtabMap:
             node.create_service(AddLink, "/rtabmap/rtabmap/add_link", self._add_link),
             node.create_service(GetMap, "/rtabmap/rtabmap/get_map_data", self._get_map),
         ]
+        answer, number = self._services[1].send_response, count()
+        self._services[1].send_response = lambda *given: answer(*given) if next(number) >= lost else None
 
     def publish(self, *ids):
         self._published.publish(self._data(ids))
@@ -102,6 +105,16 @@ def test_rtabmap_gets_links_between_its_nodes_and_its_silent_refusals_are_said(l
     assert "Traceback" not in bridge.output
     assert "5 sent, 1 without a measured pose, 0 poses without a usable covariance, 1 without a node" in bridge.output
     assert "1 refused: a node is not in its graph, 1 refused: the link contradicts its graph" in bridge.output
+
+
+def test_rtabmap_is_asked_for_its_nodes_again_where_its_answer_is_lost(listener):
+    with running("rtabmap_bridge", READY) as bridge:
+        recogniser = Recogniser(listener, "/rtabmap_bridge")
+        twin = RtabMap(listener.node, range(1, 60), lost=1)
+        recogniser.say(closure(150 * S, 110 * S))
+        wait_until(lambda: len(twin.links) == 1, 60, "the link")
+        assert bridge.end() == 0
+        assert "1 sent" in bridge.output
 
 
 def test_hydra_gets_edges_from_the_query_to_the_match(listener):
