@@ -116,10 +116,10 @@ def test_an_unknown_parameter_is_named_with_the_nearest_known_one(idle):
 
 
 def test_help_helps_instead_of_starting():
-    told = subprocess.run([executable(), "--help"], capture_output=True, text=True, timeout=60)
+    told = subprocess.run([executable(), "--help"], capture_output=True, text=True, timeout=300)
     assert told.returncode == 0
     assert all(re.search(rf"^  {name} ", told.stdout, re.M) for name in DECLARED)
-    told = subprocess.run([executable(), "accept_score:=0.7"], capture_output=True, text=True, timeout=60)
+    told = subprocess.run([executable(), "accept_score:=0.7"], capture_output=True, text=True, timeout=300)
     assert told.returncode == 2
     assert told.stderr == (
         "place_recognizer: accept_score:=0.7; allowed: parameters, as --ros-args -p NAME:=VALUE (--help lists them)\n"
