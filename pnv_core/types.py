@@ -167,6 +167,8 @@ class Evidence:
     likeness: float = 0.0  # of all: log of the distance between features of one image over that of matched ones
     rival_inliers: int = 0  # local features of the best examined candidate elsewhere
     near_inliers: int = 0  # of the best examined one near the match in its sequence, itself included
+    match_confidence: float = -1.0  # sum of the probabilities of LighterGlue's matches; -1: it was not asked
+    magnification: float = 1.0  # between the points of those in both images, at least 1
     background: float = 0.0  # similarity of the fifth most similar keyframe elsewhere; of a young map, the middle one
 
 

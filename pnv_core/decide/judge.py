@@ -18,6 +18,10 @@ from pnv_core.verify.verifier import VERIFIERS, hull_area
 
 _NEIGHBOURS = 10  # keyframes of a sequence this close to each other show one place
 AROUND = 50  # most similar keyframes to be known for the background
+_CLOSER = 2  # of the best candidates
+_UNSURE = (0.03, 0.6)  # P(same place) that a closer look may change; beyond, it costs time alone
+_SUREST = 60.0  # confidence of matches; it rarely finds more
+_EVEN = 0.5
 _ON_A_LINE = 1e8  # ratio of the largest to the least scatter
 _BACKGROUND = 5  # the first few elsewhere may be the place itself on another lap
 
@@ -95,6 +99,13 @@ class Judge:
                 )
                 verified = self._closure(query, closure.match, seen, scored[number], config.min_texture)
                 found[place] = verified, seen, number
+            for place in sorted(places, key=lambda place: self.order(found[place][0]))[:_CLOSER]:
+                closure, evidence, number = found[place]
+                if self._in_doubt(closure.score, evidence):
+                    look = self.verifier.look_closer(descriptor.thumbnail, kept[place])
+                    seen = replace(evidence, match_confidence=look.confidence, magnification=look.magnification)
+                    matched = self._closure(query, closure.match, seen, scored[number], config.min_texture)
+                    found[place] = matched, seen, number
         # what ranked lower and was not examined is not believed more than what was; what has no picture stands by
         # what its patches say
         most = max((c.score for c, e, _ in found if e.local_inliers >= 0), default=1.0)
@@ -102,6 +113,16 @@ class Judge:
         closures = [self._beside_rivals(c, closures) for c in closures]
         rest = [_not_reranked(query, *candidate, descriptor.texture) for candidate in candidates[len(references) :]]
         return sorted(closures + rest, key=self.order)
+
+    def _in_doubt(self, score: float, evidence: Evidence) -> bool:
+        """Whether a closer look may turn a candidate into a closure, or take it from those that nearly are."""
+        least, most = _UNSURE
+        surest = replace(evidence, match_confidence=_SUREST)
+        return (
+            self.calibration.matched is not None
+            and least <= score < most
+            and max(score, self.calibration.probability(surest)) >= _EVEN
+        )
 
     def _apart(self, a: ImageRef, b: ImageRef) -> bool:
         return (a.robot, a.session) != (b.robot, b.session) or abs(self._steps(a, b)) > _NEIGHBOURS

@@ -22,7 +22,7 @@ from pnv_core.describe.download import cache_folder
 from pnv_core.threads import Workers, shared
 from pnv_core.verify.feature_codes import features_only, pack, packed, picture_of, unpack
 from pnv_core.verify.matching import mutual_maxima, similarities
-from pnv_core.verify.verifier import RATIO, EpipolarCheck, hull_area
+from pnv_core.verify.verifier import RATIO, CloserLook, EpipolarCheck, hull_area
 
 WIDTH = 640  # pixels of the longer side; night against day needs it
 MOST = 500  # features: 34 kB a keyframe
@@ -137,6 +137,14 @@ def _epipolar_inliers(a: NDArray[np.float32], b: NDArray[np.float32]) -> NDArray
     return np.zeros(len(a), bool) if mask is None else mask.ravel() > 0
 
 
+def _size(points: NDArray[np.float32], weights: NDArray[np.float32]) -> float:
+    """Standard deviation of weighted points (M, 2) about their mean; 0 for none."""
+    if not weights.sum() > 0:
+        return 0.0
+    offsets = points - np.average(points, 0, weights)
+    return math.sqrt(float(np.average((offsets**2).sum(1), 0, weights)))
+
+
 def features_of(kept: bytes) -> bytes:
     """What was kept of an image less the picture; the features of the picture where a map holds that alone."""
     if picture_of(kept) == kept and kept:
@@ -155,11 +163,14 @@ class XFeatVerifier:
 
     def __init__(self, config: Config | None = None) -> None:
         from pnv_core.networks.openvino_backend import native_precision
+        from pnv_core.verify.lighterglue import LighterGlue
         from pnv_core.verify.xfeat import XFeat
 
         config = config or Config()
         _, threads = shared(config.threads, bool(config.verify))
-        self._xfeat = XFeat(WIDTH, MOST, threads, native_precision(), cache_folder() / "openvino")  # matched alike
+        settings = threads, native_precision(), cache_folder() / "openvino"  # what is found is matched alike in both
+        self._xfeat = XFeat(WIDTH, MOST, *settings)
+        self._glue = LighterGlue(*settings)
         self._features: OrderedDict[bytes, tuple[LocalFeatures, float]] = OrderedDict()
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:
@@ -181,6 +192,14 @@ class XFeatVerifier:
         """Two images by what was kept of them."""
         (one, aspect), (other, _) = self.features(query), self.features(reference)
         return epipolar_check(one, other, aspect)
+
+    def look_closer(self, query: bytes, reference: bytes) -> CloserLook:
+        """By LighterGlue. Points that all lie at one place magnify nothing."""
+        one, other = self.features(query), self.features(reference)
+        q, r, probability = self._glue.matches(*one, *other)
+        sizes = [_size(one[0].points[q], probability), _size(other[0].points[r], probability)]
+        magnification = max(sizes) / min(sizes) if min(sizes) > 0 else 1.0
+        return CloserLook(float(probability.sum()), magnification)
 
     def features(self, kept: bytes) -> tuple[LocalFeatures, float]:
         """Features as kept; where a map holds the picture alone, those of the picture."""

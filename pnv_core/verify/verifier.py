@@ -59,6 +59,16 @@ class EpipolarCheck:
         return replace(self, query=self.reference, reference=self.query, numbers=None, nearest=None)
 
 
+@dataclass(frozen=True)
+class CloserLook:
+    """What a matcher that knows all features of both images finds: the sum of its matches' probabilities, and how much
+    larger the matched points lie in one image than in the other, at least 1.
+    """
+
+    confidence: float
+    magnification: float = 1.0
+
+
 class Verifier(Protocol):
     """Compares two images by what it kept of each, as bytes that go into the map. Made from the completed Config."""
 
@@ -77,6 +87,10 @@ class Verifier(Protocol):
 
     def check(self, query: bytes, query_camera: str, reference: bytes, reference_camera: str) -> EpipolarCheck:
         """Two images by what was kept of them. Damaged bytes agree on nothing."""
+        ...
+
+    def look_closer(self, query: bytes, reference: bytes) -> CloserLook:
+        """As `check`, slower and more thorough; asked about few candidates, where the calibration has a part for it."""
         ...
 
 

@@ -15,6 +15,7 @@ from pnv_core.decide.calibration import (
     Logistic,
     accord,
     calibration_for,
+    concord,
     fit_calibration,
     reliability,
     threshold_for_precision,
@@ -96,6 +97,49 @@ def test_a_lead_counts_up_to_a_bound():
         accord(dataclasses.replace(seen, lead=lead)) - accord(dataclasses.replace(seen, lead=0.0)) for lead in leads
     ]
     assert np.allclose(added, [0.0, 0.0, 0.6, 0.9, 0.9])
+
+
+def looked_at(rng, n):
+    """Evidence of a closer look, whose truth follows a logistic law in what it found."""
+    found = []
+    for e, _, _ in drawn(rng, n):
+        sure, times = float(rng.uniform(0, 80)), float(rng.uniform(1, 3))
+        e = dataclasses.replace(e, match_confidence=sure, magnification=times)
+        says = np.log((sure + 1) / times * np.sqrt(e.spatial)) + 2 * e.likeness + 8 * max(e.lead, 0) - 5 * e.background
+        probability = 1 / (1 + np.exp(-0.9 * says - 0.3))
+        found.append((e, bool(rng.random() < probability), probability))
+    return found
+
+
+def test_what_was_looked_at_closer_has_a_probability_of_its_own():
+    rng = np.random.default_rng(0)
+    examples = [(e, t) for e, t, _ in drawn(rng, 3000) + looked_at(rng, 6000)]
+    fitted = fit_calibration(examples, np.ones(9000), CONFIG, "drawn")
+    fresh = looked_at(rng, 500)
+    assert np.mean([abs(fitted.probability(e) - p) for e, _, p in fresh]) < 0.03
+    assert fitted == Calibration.from_json(json.loads(json.dumps(fitted.to_json())))
+    without = fit_calibration([(e, t) for e, t, _ in drawn(rng, 3000)], np.ones(3000), CONFIG, "drawn")
+    assert without.matched is None
+    for e, _, _ in fresh:  # what nothing was fitted for counts for nothing
+        assert without.probability(e) == without.probability(dataclasses.replace(e, match_confidence=-1.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "rises"),
+    [
+        ("match_confidence", 9.0, True),
+        ("spatial", 0.1, True),
+        ("likeness", 0.2, True),
+        ("lead", 0.05, True),
+        ("magnification", 0.5, False),
+        ("background", 0.1, False),
+    ],
+)
+def test_a_closer_look_believes_in_more_and_surer_matches_of_one_size(name, more, rises):
+    seen = Evidence(0.6, 0.2, 40, likeness=-0.9, background=0.3, match_confidence=20.0, magnification=1.2)
+    change = concord(dataclasses.replace(seen, **{name: getattr(seen, name) + more})) - concord(seen)
+    assert (change > 0.05) if rises else (change < -0.05)
+    assert concord(dataclasses.replace(seen, local_inliers=300)) == concord(seen)
 
 
 def test_an_unknown_model_believes_no_candidate_on_its_patches_alone():

@@ -1,13 +1,16 @@
 """What the judge knows of a candidate beside the pair itself."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pnv_core.decide.calibration import Logistic
 from pnv_core.decide.judge import spread_and_distortion
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, PatchGrid, PatchMatches, PlaceDescriptor
+from pnv_core.verify.verifier import CloserLook
 from test.core.small import noise_image, small_describer
 
 S = 1_000_000_000
@@ -42,6 +45,9 @@ class Told:
     def prepare(self, kept, workers):
         pass
 
+    def look_closer(self, query, reference):
+        raise AssertionError("nobody asked for a closer look")
+
     def check(self, query, query_camera, reference, reference_camera):
         return SimpleNamespace(
             inliers=reference[0], spread=0.5, inlier=np.ones(9, bool), likeness=0.0, matches_beside=len
@@ -65,6 +71,48 @@ def test_support_near_the_match_and_elsewhere_is_that_of_the_candidates_examined
         assert c.evidence.rival_inliers == max(elsewhere, default=0)
         if c.match.id in examined:
             assert c.evidence.own_matches == len(elsewhere)
+
+
+class Closer(Told):
+    """And is as sure as the picture of the match says."""
+
+    def __init__(self):
+        self.looks = []
+
+    def look_closer(self, query, reference):
+        self.looks.append(reference[0])
+        return CloserLook(reference[0] / 3, 1.25)
+
+
+def test_only_candidates_in_doubt_are_looked_at_closer_and_two_at_most():
+    every = {"min_interval_s": 0.0, "min_change": 0.0, "exclude_recent_s": 5.0, "consistency": 0}
+    describer = small_describer(verify=8, candidates=12, **every)
+    recognizer = PlaceRecognizer(describer)
+    judge, before = recognizer.judge, Logistic(3.0, {"accord": 1.5})
+    judge.calibration = replace(judge.calibration, verified=before, matched=Logistic(-3.0, {"concord": 3.0}))
+    judge.verifier = Closer()
+    seen = {"looked": 0, "sure": 0, "hopeless": 0}
+    for i in range(80):
+        judge.verifier.looks.clear()
+        found = recognizer.process(Frame(i * S, "front", noise_image(i % 23)))
+        closer = [c.evidence for c in found if c.evidence.match_confidence >= 0]
+        assert len(judge.verifier.looks) == len(closer) <= 2
+        for e in closer:
+            assert 0.03 <= before.probability(e) < 0.6
+            assert e.match_confidence == pytest.approx(e.local_inliers / 3)
+            assert e.magnification == 1.25
+        surest = judge.calibration.matched
+        for c in found:
+            e = c.evidence
+            if e.match_confidence < 0 <= e.local_inliers:
+                most = surest.probability(replace(e, match_confidence=60.0))
+                seen["sure"] += before.probability(e) >= 0.6
+                seen["hopeless"] += before.probability(e) < 0.5 and most < 0.5
+                assert c.score == pytest.approx(before.probability(e))
+            elif e.match_confidence >= 0:
+                seen["looked"] += 1
+                assert c.score == pytest.approx(surest.probability(e))
+    assert min(seen.values()) > 5, seen
 
 
 @pytest.mark.parametrize("seed", range(8))
