@@ -1,13 +1,20 @@
 """Calibration on a user's own sequence: run the recogniser, tell true candidates from false ones, fit."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pnv_core.decide.calibration import Calibration, Reliability, fit_calibration, reliability, threshold_for_precision
+from pnv_core.decide.calibration import (
+    Calibration,
+    Reliability,
+    calibration_for,
+    fit_calibration,
+    reliability,
+    threshold_for_precision,
+)
 from pnv_core.describe.describer import Describer
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Evidence, Frame
@@ -50,9 +57,16 @@ def gather_examples(
 
 
 def calibrate(examples: Examples, describer: Describer, source: str) -> Calibration:
-    """The calibration of the examples; true and false ones keep their numbers. Raises ModelError for one class only."""
-    pairs = list(zip(examples.evidence, (bool(t) for t in examples.true), strict=True))
-    return fit_calibration(pairs, np.ones(len(pairs)), describer.config, source)
+    """The calibration of the examples; true and false ones keep their numbers. Raises ModelError for one class only.
+
+    A sequence has few candidates in doubt: what the closer look is worth stays as the model has it.
+    """
+    pairs = [
+        (replace(e, match_confidence=-1.0), bool(true))
+        for e, true in zip(examples.evidence, examples.true, strict=True)
+    ]
+    own = calibration_for(describer.model.info.calibration, describer.config)
+    return replace(fit_calibration(pairs, np.ones(len(pairs)), describer.config, source), matched=own.matched)
 
 
 @dataclass(frozen=True, eq=False)

@@ -172,11 +172,12 @@ def _counts(models: NDArray[np.float32], terms: NDArray[np.float32]) -> NDArray[
 
 
 def _count(models: NDArray[np.float32], terms: NDArray[np.float32]) -> NDArray[np.int64]:
-    residuals = models @ terms
-    np.square(residuals, out=residuals)
-    across, down, limit = np.split(residuals, 3, axis=1)
-    across += down
-    across += _AT_INFINITY
+    with np.errstate(over="ignore"):  # infinitely far off
+        residuals = models @ terms
+        np.square(residuals, out=residuals)
+        across, down, limit = np.split(residuals, 3, axis=1)
+        across += down
+        across += _AT_INFINITY
     return np.asarray(np.count_nonzero(across <= limit, axis=1))
 
 

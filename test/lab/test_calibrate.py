@@ -1,12 +1,14 @@
 """`pnv calibrate` as a user meets it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 from pnv_cli.main import main
-from pnv_core.decide.calibration import Calibration
+from pnv_core.decide.calibration import Calibration, Logistic
 from pnv_core.describe.model_files import load_model, save_model
 from test.core.small import small_model
 from test.verify.test_local_features import scene
@@ -43,6 +45,22 @@ def test_a_sequence_without_labels_calibrates_a_model(model, way, tmp_path, caps
     fitted = load_model(out)
     assert fitted.fingerprint() == load_model(model).fingerprint()
     assert Calibration.from_json(fitted.info.calibration).patch_sizes == (2, 5)
+
+
+def test_what_the_closer_look_is_worth_stays_as_the_model_has_it(model, way, tmp_path):
+    """A few candidates in doubt would fit anything. Under settings that the model's calibration is not for, it goes."""
+    first, second, other = (tmp_path / f"{n}.safetensors" for n in range(3))
+    flags = ["calibrate", "--images", str(way), "--near-s", "2", "--far-s", "12", *QUICK]
+    assert main([*flags, "--weights", str(model), "-o", str(first)]) == 0
+    fitted = load_model(first)
+    before = Calibration.from_json(fitted.info.calibration)
+    assert before.matched is None
+    closer = replace(before, matched=Logistic(-1.0, {"concord": 2.0}))
+    save_model(fitted.with_info(calibration=closer.to_json()), first)
+    assert main([*flags, "--weights", str(first), "-o", str(second)]) == 0
+    assert Calibration.from_json(load_model(second).info.calibration).matched == closer.matched
+    assert main([*flags, "--weights", str(first), "--patch-sizes", "2", "-o", str(other)]) == 0
+    assert Calibration.from_json(load_model(other).info.calibration).matched is None
 
 
 def test_matches_and_poses_serve_as_truth(model, way, tmp_path):
