@@ -28,7 +28,7 @@ from pnv_core.errors import PnvError
 IMAGE_TOPIC, INFO_TOPIC = "camera/image_raw", "camera/camera_info"
 ODOMETRY_TOPIC = "odometry"
 BUSY = "dropped: busy"  # of the node's diagnostics
-_WAIT_FOR_LISTENERS_S = 60.0
+_WAIT_FOR_LISTENERS_S = 120.0
 
 
 def read_odometry(path: Path) -> deque[tuple[int, list[float]]]:
@@ -132,7 +132,7 @@ def main() -> int:
 
 
 def _wait_for_listeners(publishers: list) -> None:
-    """Until everyone who should listen does, so that the first frame is not lost. Raises PnvError after a minute."""
+    """Until everyone who should listen does, so that the first frame is not lost. Raises PnvError after two minutes."""
     end = time.monotonic() + _WAIT_FOR_LISTENERS_S
     while not all(publisher.get_subscription_count() for publisher in publishers):
         if time.monotonic() > end:

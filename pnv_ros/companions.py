@@ -7,7 +7,13 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import qos_policy_name_from_kind, qos_profile_sensor_data
+from rclpy.qos import (
+    QoSDurabilityPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+    qos_policy_name_from_kind,
+    qos_profile_sensor_data,
+)
 from sensor_msgs.msg import CameraInfo, Image
 
 from msg_adapters.camera_info import Rectifier, baseline_of, calibration_of
@@ -22,6 +28,8 @@ from pnv_ros.node_config import NodeConfig
 from pnv_ros.view import View
 
 _REPEAT_S = 10.0  # the same complaint is not made more often
+_TRANSIENT_LOCAL = QoSDurabilityPolicy.TRANSIENT_LOCAL
+_LATCHED = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.RELIABLE, durability=_TRANSIENT_LOCAL)
 
 
 def is_rectified(topic: str) -> bool:
@@ -60,12 +68,18 @@ class Companions:
         self._subscriptions.clear()
 
     def waiting_for(self, camera: str) -> str:
-        """Why a camera has no CameraInfo yet, in words."""
+        """Why a camera has no CameraInfo yet, in words. One that was said once is asked for."""
         topic = self._info_topics[camera]
         publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(topic))
         kinds = sorted({p.topic_type for p in publishers} - {"sensor_msgs/msg/CameraInfo"})
         if not publishers:
             return f"nobody publishes {topic}"
+        heard = self._subscriptions[topic]
+        if heard.qos_profile.durability != _TRANSIENT_LOCAL and all(
+            p.qos_profile.durability == _TRANSIENT_LOCAL for p in publishers
+        ):  # said once, before this node was there, and kept for who asks for it
+            self._node.destroy_subscription(heard)
+            self._subscribe(CameraInfo, topic, self._calibrate(camera), _LATCHED)
         return f"{topic} is published as {kinds[0]}" if kinds else f"{topic} has carried no usable CameraInfo"
 
     def report_mismatches(self) -> None:
@@ -75,12 +89,14 @@ class Companions:
             ours = qos_in_words(self._subscriptions[topic].qos_profile)
             self._node.get_logger().warning(f"a publisher of {topic} is not heard: its {policy} does not suit {ours}")
 
-    def _subscribe(self, kind: type, topic: str, receive: Callable[[Any], None]) -> None:
+    def _subscribe(
+        self, kind: type, topic: str, receive: Callable[[Any], None], qos: QoSProfile = qos_profile_sensor_data
+    ) -> None:
         def mismatch(info: Any) -> None:
             self._mismatches[topic] = qos_policy_name_from_kind(info.last_policy_kind).lower()
 
         self._subscriptions[topic] = self._node.create_subscription(
-            kind, topic, receive, qos_profile_sensor_data,
+            kind, topic, receive, qos,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=mismatch),
         )  # fmt: skip
 

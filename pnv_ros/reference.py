@@ -132,10 +132,11 @@ Names without a leading slash are relative to the node's namespace, `~` is the n
 | `odometry_topic` (none) | nav_msgs/Odometry | best effort, volatile | optional; rules closures out, places keyframes |
 | `pose_topic` (none) | geometry_msgs/PoseStamped | best effort, volatile | optional; places keyframes, in the map |
 
-A CameraInfo is taken anew whenever it changes, and refused where no camera has such numbers. Images of a topic with a
-part `image_rect...` in its name are taken as rectified: they stay as they are, and their `P` counts. Odometry is
-believed in so far as it follows: less than 0.2 m is no way gone, and a sample that no robot can reach is not taken
-until two others have followed it, when another run begins.
+A CameraInfo is taken anew whenever it changes, and refused where no camera has such numbers; one that was published
+once and is kept (transient local) is asked for. Images of a topic with a part `image_rect...` in its name are taken as
+rectified: they stay as they are, and their `P` counts. Odometry is believed in so far as it follows: less than 0.2 m is
+no way gone, and a sample that no robot can reach is not taken until two others have followed it, when another run
+begins.
 
 `transport: auto` takes the message type that is published. Of Image these encodings are understood: {encodings};
 row padding and byte order are honoured. CompressedImage is jpeg or png, 8 or 16 bit. Sides are 16 to 16384 pixels, 67

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.parameter import parameter_value_to_python
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import SetBool
 
@@ -60,6 +60,23 @@ def test_camera_infos_are_heard_checked_and_taken_anew_and_frames_without_one_ar
         tally("4 camera infos heard by the node", 3, 3)
         assert node.end() == 0
         assert "Traceback" not in node.output
+
+
+def test_a_camera_info_that_was_said_once_before_the_node_was_there_is_heard(listener):
+    once = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+    listener.node.create_publisher(CameraInfo, "camera_info", once).publish(calibration())
+    with running_node(camera_info_topics=["camera_info"], **EAGER) as node:
+        health = Health(listener)
+        camera = Camera(listener, health, "camera/image_raw")
+        seconds = count(1)
+
+        def shows():  # until frames wait for their camera info, and are used
+            camera.send(image(scene(1), at(next(seconds))))
+            return health.count("frames processed")
+
+        wait_until(shows, 60, "a frame in use")
+        assert "images of camera/image_raw are rectified as 320x240" in node.output
+        assert node.end() == 0
 
 
 def test_diagnostics_say_why_none_of_the_frames_that_come_is_used(listener):
