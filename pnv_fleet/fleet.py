@@ -447,9 +447,10 @@ class Fleet:
     def _well(self, part: str) -> None:
         with self._changed:
             trouble = self._troubles.pop(part, None)
+            others = [text for text, _ in self._troubles.values()]
         if part in _LANES:
             self._pause_s[part] = self._again[part] = 0.0
-        if trouble is not None:
+        if trouble is not None and trouble[0] not in others:
             self._say(f"fleet: well again after {time.time() - trouble[1]:.0f} s: {trouble[0]}")
 
     def _tally(self, **more: int) -> None:

@@ -158,6 +158,26 @@ def test_a_store_that_answers_but_has_no_room_is_one_line(server, tmp_path, monk
     alpha.fleet.close()
 
 
+def test_a_store_that_goes_and_comes_back_is_said_once_each(server, tmp_path, monkeypatch):
+    away = True
+
+    def opened(uri, *more):
+        if away:
+            raise FleetError(f"{uri}: the store cannot be reached")
+        return PlaceStore(uri, *more)
+
+    monkeypatch.setattr("pnv_fleet.fleet.PlaceStore", opened)
+    alpha = Robot(tmp_path, "alpha", server.uri)
+    alpha.see(1, 2)
+    wait_until(lambda: len(alpha.fleet._troubles) == 2, 60, "both, who asks and who sends, to fail")
+    away = False
+    alpha.settled()
+    wait_until(lambda: not alpha.status.problem, 60, "an end of it")
+    told = [" ".join(line.split()[1:3]) for line in alpha.lines if "cannot be reached" in line]
+    assert told == [f"{server.uri}: the", "well again"]
+    alpha.fleet.close()
+
+
 @pytest.mark.parametrize("kind", ["served", "file"])
 def test_a_failing_upload_leaves_the_query_in_hand_alone(server, tmp_path, monkeypatch, kind):
     uri = server.uri if kind == "served" else str(tmp_path / "places.db")

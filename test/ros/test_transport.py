@@ -49,9 +49,12 @@ def test_four_cameras_have_equal_shares(domain, listener, tmp_path):
         running_node(image_topics=topics, min_interval_s=0.0, min_change=0.0, threads=1) as node,
         cameras(tmp_path, "--topic", ",".join(topics), "--encoding", "jpeg", rate=10),
     ):
-        wait_until(lambda: health.count("frames processed") >= 60, 300, "frames of every camera")
-        values = health.fresh() and health.values()
-        shares = [int(values[f"share of what is processed, {topic} [%]"]) for topic in topics]
+        wait_until(lambda: health.count("frames processed") >= 20, 300, "frames of every camera")
+        seen, before = [], health.count("frames processed")
+        while health.count("frames processed") < before + 60:  # one status of a slow machine is of a few frames
+            values = health.fresh() and health.values()
+            seen.append([int(values[f"share of what is processed, {topic} [%]"]) for topic in topics])
+        shares = np.mean(seen, axis=0)
         assert sum(shares) == pytest.approx(100, abs=2)
         assert min(shares) >= 20
         assert max(shares) <= 30
