@@ -33,8 +33,8 @@ from pnv_lab.evaluation.local_features import ratio_matches, sift_record
 
 NEAR = 2  # false by a ground truth that is too narrow, and a small motion by geometry: neither right nor wrong
 ALIKE = "tower"  # no look, however close, tells its floors apart
-CLOSER_CAUTION = 0.6  # the same of the closer look: what it finds falsely is mostly one street from farther along
 CAUTION = 0.7  # what a false candidate counts in the fit: a fifth of it is a tower of floors that nobody tells apart
+CLOSER_CAUTION = 0.6  # the same of the closer look: what it finds falsely is mostly one street from farther along
 
 
 class RememberedDescriber:
@@ -249,7 +249,7 @@ def recall_at_full_precision(scores: NDArray, correct: NDArray, loops: int) -> f
 def table(found: Judged) -> list[dict]:
     """One row per way to decide: by similarity, by spatial score, by calibrated score, and after consistency.
 
-    `first` counts the queries with a revisit whose first candidate is true: by that score, in the last row in the order
+    `looks` are the candidates a query that were looked at closer. `first` counts the queries with a revisit whose first candidate is true: by that score, in the last row in the order
     that the recogniser gives.
     """
     rows = []
@@ -285,6 +285,8 @@ def table(found: Judged) -> list[dict]:
                 "recall": float((hit & found.loops).sum() / loops) if loops else float("nan"),
                 "recall@100%": recall_at_full_precision(scores, correct, loops),
                 "ece": reliability(p, t).expected_error if len(p) else float("nan"),
+                "looks": sum(c.evidence.match_confidence >= 0 for q in found.queries for c, _ in q)
+                / max(len(found.queries), 1),
             }
         )  # fmt: skip
     return rows
@@ -294,7 +296,8 @@ def printed(row: dict) -> str:
     return (
         f"{row['sequence']:<14} {row['way']:<11} {row['queries']:5d} {row['loops']:5d}  {row['precision']:9.3f} "
         f"{row['false']:6d} {row['false per 1000']:8.1f} {row['near']:5d} "
-        f"{row['recall']:7.3f} {row['recall@100%']:12.3f} {row['ece']:6.3f} {row['first']:6d}"
+        f"{row['recall']:7.3f} {row['recall@100%']:12.3f} {row['ece']:6.3f} {row['first']:6d} "
+        f"{row['looks']:6.2f}"
     )
 
 
@@ -336,7 +339,7 @@ def main(argv: list[str] | None = None) -> int:
         args.pictures.mkdir(parents=True, exist_ok=True)
     print(
         f"{'sequence':<14} {'way':<11} {'query':>5} {'loops':>5}  "
-        "precision  false per 1000  near  recall  recall@100%P    ece  first"
+        "precision  false per 1000  near  recall  recall@100%P    ece  first  looks"
     )
     results = []
     for name in args.names or JUDGE:

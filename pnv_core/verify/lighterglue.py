@@ -38,11 +38,11 @@ def _weights() -> dict[str, NDArray[np.float32]]:
 
 
 class LighterGlue:
-    """The matcher, compiled when it is first asked."""
+    """The matcher, compiled when it is first asked. Threads take turns."""
 
     def __init__(self, threads: int = 0, precision: str = "float32", folder: Path | None = None) -> None:
         """Threads and precision as in Config; `folder` is for what is compiled."""
-        kept = None if folder is None else folder / f"lighterglue_{_GRAPH}_{MOST}"
+        kept = None if folder is None else folder / f"lighterglue_{_GRAPH}_{MOST}_{precision}_{threads}"
         self._compile = cache(lambda: Compiled(_graph, threads, precision, kept))
 
     def matches(
@@ -50,9 +50,9 @@ class LighterGlue:
     ) -> tuple[Indices, Indices, NDArray[np.float32]]:
         """Numbers of matched features (query, reference), (M,) each, and how probable each match is.
 
-        An aspect is height / width of an image.
+        An aspect is height / width of an image. Of more than MOST features the first are looked at.
         """
-        count = len(query.points), len(reference.points)
+        count = [min(len(image.points), MOST) for image in (query, reference)]
         if not min(count):
             return np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
         points = np.zeros((2, MOST, 2), np.float32)
@@ -60,14 +60,18 @@ class LighterGlue:
         absent = np.full((2, 1, MOST), _ABSENT, np.float32)
         for number, (image, aspect) in enumerate(((query, query_aspect), (reference, reference_aspect))):
             own = slice(count[number])
-            points[number, own] = (image.points - (0.5, aspect / 2)) * (2 / max(1.0, aspect))
-            descriptors[number, own], absent[number, 0, own] = image.descriptors, 0.0
+            points[number, own] = (image.points[own] - (0.5, aspect / 2)) * (2 / max(1.0, aspect))
+            descriptors[number, own], absent[number, 0, own] = image.descriptors[own], 0.0
         (probability,) = self._compile()(points, descriptors, absent)
         probability = np.ascontiguousarray(probability[0, : count[0], : count[1]])
         r, q = mutual_maxima(probability)
         found = probability[q, r]
         sure = found > _LEAST
         return q[sure], r[sure], found[sure]
+
+
+lighterglue = cache(LighterGlue)
+"""The one with these settings that the whole process shares: a fleet's lanes have judges of their own."""
 
 
 def _graph() -> ov.Model:

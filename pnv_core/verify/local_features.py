@@ -163,14 +163,14 @@ class XFeatVerifier:
 
     def __init__(self, config: Config | None = None) -> None:
         from pnv_core.networks.openvino_backend import native_precision
-        from pnv_core.verify.lighterglue import LighterGlue
+        from pnv_core.verify.lighterglue import lighterglue
         from pnv_core.verify.xfeat import XFeat
 
         config = config or Config()
         _, threads = shared(config.threads, bool(config.verify))
         settings = threads, native_precision(), cache_folder() / "openvino"  # what is found is matched alike in both
         self._xfeat = XFeat(WIDTH, MOST, *settings)
-        self._glue = LighterGlue(*settings)
+        self._glue = lighterglue(*settings)
         self._features: OrderedDict[bytes, tuple[LocalFeatures, float]] = OrderedDict()
 
     def keep(self, rgb: NDArray[np.uint8], camera: str, valid: NDArray[np.bool_] | None = None) -> bytes:

@@ -90,7 +90,10 @@ class Verifier(Protocol):
         ...
 
     def look_closer(self, query: bytes, reference: bytes) -> CloserLook:
-        """As `check`, slower and more thorough; asked about few candidates, where the calibration has a part for it."""
+        """As `check`, slower and more thorough; asked about few candidates, where the calibration has a part for it.
+
+        Only the shipped model's has one, for xfeat: another verifier does without this method.
+        """
         ...
 
 

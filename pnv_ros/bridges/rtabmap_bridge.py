@@ -5,6 +5,7 @@ what became of each link. One link is asked for at a time.
 """
 
 import math
+import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from typing import Any
@@ -36,7 +37,7 @@ class RtabmapBridge(MetricBridge):
         self._stamps: dict[int, int] = {}
         self._queue: deque[NodePair] = deque()
         self._asked: NodePair | None = None
-        self._asked_at, self._knows_the_map, self._told = 0, False, False
+        self._asked_at, self._knows_the_map, self._told = 0.0, False, False
         self._map_asked_at = -math.inf
         self.taken, self.refused = 0, Counter[str]()
         self._add = self.create_client(self._types.AddLink, f"{config.rtabmap_node}/add_link")
@@ -80,11 +81,11 @@ class RtabmapBridge(MetricBridge):
             self._knows_the_map, self._map_asked_at, self._asked = False, -math.inf, None
             return
         self._told = False
-        now = self.get_clock().now().nanoseconds
-        if not self._knows_the_map and now - self._map_asked_at > _ANSWER_S * 1e9:
+        now = time.monotonic()  # an answer takes its time whatever a simulation's clock says
+        if not self._knows_the_map and now - self._map_asked_at > _ANSWER_S:
             self._map_asked_at = now  # the answer is lost where RTAB-Map does not know this client yet
             self._whole_graph(self._learn)
-        if self._asked is not None and now - self._asked_at > _ANSWER_S * 1e9:
+        if self._asked is not None and now - self._asked_at > _ANSWER_S:
             self._settle(f"no answer in {_ANSWER_S:.0f} s")
         if self._asked is None and self._queue:
             self._asked, self._asked_at = self._queue.popleft(), now

@@ -43,8 +43,9 @@ def test_a_robot_with_odometry_is_corrected_on_tf_and_path(listener, tmp_path):
         wait_until(lambda: bridge.output.count("no odometry on /odom for ") > before, 60, "a word of silence")
         for i in (90, 91, 92, 93):
             sent.publish(odometry_message(i * S, odometry[-1]))
-        back = lambda: bridge.output.rfind("odometry is back") > bridge.output.rfind("no odometry on /odom for ")  # noqa: E731
-        wait_until(back, 60, "odometry to be back")
+        wait_until(
+            lambda: bridge.output.rfind("odometry is back") > bridge.output.rfind("no odometry on"), 60, "odometry"
+        )
         wait_until(lambda: len(transforms) >= 94, 60, "the last transform")
         recogniser.say(closure(10**18, 5 * S), None)  # an image of another clock: waits for odometry for ever
         answer = listener.call(Trigger, "/tf_bridge/save", Trigger.Request())

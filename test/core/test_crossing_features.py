@@ -22,8 +22,8 @@ from test.core.small import HEIGHT, WIDTH, noise_image, small_model
 SECOND = 10**9
 PLACES = 6
 _SCORES = Calibration(  # of no model; it lets scores of a revisit spread over 0 to 1
-    Logistic(4.0, {"spatial": 3.0}), Logistic(1.0, {"spatial": 2.0, "local_inliers": 2.0}),
-    patch_sizes=(2, 5), image_size=(WIDTH, HEIGHT),
+    Logistic(4.0, {"spatial": 3.0}), Logistic(4.0, {"accord": 1.0}),
+    patch_sizes=(2, 5), image_size=(WIDTH, HEIGHT), verifier="xfeat", matched=Logistic(2.0, {"concord": 1.0}),
 )  # fmt: skip
 
 

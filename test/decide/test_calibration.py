@@ -252,9 +252,10 @@ def test_a_malformed_calibration_is_refused(change):
 def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilities_and_what_it_is_for_is_said():
     right = Calibration(
         Logistic(-1.0, {"spatial": 2.0}), Logistic(-2.0, {"accord": 3.0}), "ransac", (2, 3), (320, 240), "a test",
-        verifier="xfeat",
+        verifier="xfeat", matched=Logistic(-1.0, {"concord": 2.0}),
     )  # fmt: skip
-    evidence = [e for e, _, _ in drawn(np.random.default_rng(0), 20)]
+    rng = np.random.default_rng(0)
+    evidence = [e for e, _, _ in drawn(rng, 20) + looked_at(rng, 20)]
     outcome = {"refused": 0, "said": 0, "same": 0}
 
     @settings(max_examples=count(200, 20_000), deadline=None, database=None)
@@ -272,6 +273,9 @@ def test_a_calibration_of_any_content_is_refused_in_one_line_or_gives_probabilit
         outcome["said" if calibration is CONSERVATIVE else "same"] += 1
 
     read()
+    former = right.to_json() | {"matched": {"bias": 0.0, "weights": {"agreement": 1.0}}}
+    assert calibration_for(former, CONFIG) is CONSERVATIVE
+    assert "agreement of an earlier release" in why_conservative(former, CONFIG)
     tried = sum(outcome.values())
     tally("8 calibrations with other content", tried, tried)
     assert min(outcome.values()) > 0

@@ -8,6 +8,7 @@ import pytest
 
 from pnv_core.decide.calibration import Logistic
 from pnv_core.decide.judge import spread_and_distortion
+from pnv_core.decide.order import standing
 from pnv_core.recognizer import PlaceRecognizer
 from pnv_core.types import Frame, PatchGrid, PatchMatches, PlaceDescriptor
 from pnv_core.verify.verifier import CloserLook
@@ -84,14 +85,21 @@ class Closer(Told):
         return CloserLook(reference[0] / 3, 1.25)
 
 
+def doubted(evidence, before, surest):
+    """Whether the score leaves doubt that the surest matches would settle."""
+    at_best = replace(evidence, match_confidence=60.0, magnification=1.0)
+    score, most = (part.probability(at_best) for part in (before, surest))
+    return 0.03 <= score < 0.6 and max(score, most) >= 0.5
+
+
 def test_only_candidates_in_doubt_are_looked_at_closer_and_two_at_most():
     every = {"min_interval_s": 0.0, "min_change": 0.0, "exclude_recent_s": 5.0, "consistency": 0}
     describer = small_describer(verify=8, candidates=12, **every)
     recognizer = PlaceRecognizer(describer)
     judge, before = recognizer.judge, Logistic(3.0, {"accord": 1.5})
     judge.calibration = replace(judge.calibration, verified=before, matched=Logistic(-3.0, {"concord": 3.0}))
-    judge.verifier = Closer()
-    seen = {"looked": 0, "sure": 0, "hopeless": 0}
+    judge.verifier, surest = Closer(), judge.calibration.matched
+    seen, both = {"looked": 0, "sure": 0, "hopeless": 0}, 0
     for i in range(80):
         judge.verifier.looks.clear()
         found = recognizer.process(Frame(i * S, "front", noise_image(i % 23)))
@@ -101,7 +109,13 @@ def test_only_candidates_in_doubt_are_looked_at_closer_and_two_at_most():
             assert 0.03 <= before.probability(e) < 0.6
             assert e.match_confidence == pytest.approx(e.local_inliers / 3)
             assert e.magnification == 1.25
-        surest = judge.calibration.matched
+        best = sorted(
+            (c for c in found if c.evidence.local_inliers >= 0),
+            key=lambda c: (-standing(c.evidence), -c.similarity, c.match.id),
+        )[:2]
+        wanted = {c.match.id for c in best if doubted(c.evidence, before, surest)}
+        assert {c.match.id for c in found if c.evidence.match_confidence >= 0} == wanted
+        both += len(wanted) == 2
         for c in found:
             e = c.evidence
             if e.match_confidence < 0 <= e.local_inliers:
@@ -113,6 +127,7 @@ def test_only_candidates_in_doubt_are_looked_at_closer_and_two_at_most():
                 seen["looked"] += 1
                 assert c.score == pytest.approx(surest.probability(e))
     assert min(seen.values()) > 5, seen
+    assert both
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -10,9 +10,11 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from pnv_core.database import KeyframeDatabase
+from pnv_core.decide.calibration import Logistic
 from pnv_core.errors import PnvError
 from pnv_core.maps import MapStore
 from pnv_core.types import PatchGrid, PlaceDescriptor
+from pnv_core.verify.feature_codes import pack
 from pnv_core.verify.local_features import XFeatVerifier, decoded
 from test.maps.test_closures import small_frames, small_recognizer
 from test.maps.worlds import contents
@@ -29,6 +31,8 @@ def bomb() -> bytes:
 
 BOMB = bomb()
 PICTURES = [b"", b"\xff\xd8\xff", b"PNVX", b"PNVX\xff\xff" + bytes(4000), BOMB, BOMB[:2000]]
+_RNG = np.random.default_rng(0)
+PICTURES += [pack(_RNG.random((n, 2), np.float32), _RNG.random((n, 64), np.float32), 0.75) for n in (1, 600, 1900)]
 PICTURES += [cv2.imencode(".png", np.zeros((9, 9)))[1].tobytes()]
 
 
@@ -63,6 +67,8 @@ def spoilt(kept: PlaceDescriptor, how: str, data: st.DataObject) -> PlaceDescrip
 def test_keyframes_that_no_describer_gave_are_refused_or_harmless(tmp_path_factory, mapped, precision):
     maker, kept = mapped
     finder = small_recognizer(read_only=True, verify=3, patch_precision=precision)
+    decides = replace(finder.judge.calibration, verified=Logistic(-1.0, {}), matched=Logistic(5.0, {"concord": 1.0}))
+    finder.judge.calibration = decides  # who is in doubt about everything
     outcome = {"refused": 0, "met": 0}
 
     @settings(

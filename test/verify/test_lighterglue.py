@@ -12,6 +12,7 @@ from pnv_core.errors import ConfigError
 from pnv_core.images import read_image
 from pnv_core.verify.lighterglue import LAYERS, WEIGHTS, LighterGlue
 from pnv_core.verify.local_features import MOST, LocalFeatures, XFeatVerifier, epipolar_check
+from pnv_core.verify.verifier import CloserLook
 from pnv_lab.evaluation.local_features import lighterglue
 
 PIXELS = 640
@@ -102,13 +103,14 @@ def random_features(seed, count):
     return LocalFeatures(points, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize(("count", "other"), [(MOST, MOST), (MOST, 37), (1, MOST), (120, 240)])
+@pytest.mark.parametrize(("count", "other"), [(MOST, MOST), (MOST, 37), (1, MOST), (120, 240), (MOST + 100, 9)])
 def test_probabilities_are_those_of_the_paper_whatever_the_number_of_features(count, other):
     """Half of the features are the same in both, moved; the padding of the others must not be heard."""
     one, two = random_features(1, count), random_features(2, other)
     same = min(count, other) // 2
     two.descriptors[:same], two.points[:same] = one.descriptors[:same], one.points[:same] + 0.05
-    expected = mutual(Published().probability([(one, 0.75), (two, 1.3)]))
+    seen = [LocalFeatures(f.points[:MOST], f.descriptors[:MOST]) for f in (one, two)]  # of more, the first
+    expected = mutual(Published().probability(list(zip(seen, (0.75, 1.3), strict=True))))
     q, r, probability = LighterGlue(1).matches(one, 0.75, two, 1.3)
     clear = {pair: p for pair, p in expected.items() if p > 0.11}
     found = dict(zip(zip(q.tolist(), r.tolist(), strict=True), probability.tolist(), strict=True))
@@ -173,7 +175,9 @@ def test_magnification_is_that_of_an_image_made_smaller(shared, verifier, factor
     assert verifier.look_closer(*kept[::-1]).magnification == pytest.approx(look.magnification, rel=0.1)
 
 
-def test_what_is_damaged_or_empty_is_matched_with_nothing(verifier):
-    blank = verifier.keep(np.full((48, 64, 3), 90, np.uint8), "")
-    assert verifier.look_closer(blank, b"no such").confidence == 0.0
-    assert verifier.look_closer(b"", blank).magnification == 1.0
+@pytest.mark.parametrize("spoilt", [b"", b"no such", b"PNVX\xff\xff" + bytes(4000)])
+def test_what_is_damaged_or_empty_is_matched_with_nothing(shared, verifier, spoilt):
+    kept = verifier.keep(read_image(sorted((shared / "data/tiny").glob("*/*.jpg"))[0]), "")
+    assert verifier.look_closer(kept, kept).confidence > 100
+    for pair in ((kept, spoilt), (spoilt, kept), (spoilt, spoilt)):
+        assert verifier.look_closer(*pair) == CloserLook(0.0, 1.0)
