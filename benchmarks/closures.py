@@ -249,8 +249,8 @@ def recall_at_full_precision(scores: NDArray, correct: NDArray, loops: int) -> f
 def table(found: Judged) -> list[dict]:
     """One row per way to decide: by similarity, by spatial score, by calibrated score, and after consistency.
 
-    `looks` are the candidates a query that were looked at closer. `first` counts the queries with a revisit whose first candidate is true: by that score, in the last row in the order
-    that the recogniser gives.
+    `looks` are the candidates a query that were looked at closer. `first` counts the queries with a revisit whose
+    first candidate is true: by that score, in the last row in the order that the recogniser gives.
     """
     rows = []
     loops = int(found.loops.sum())
