@@ -1,6 +1,7 @@
 """`pnv`: the command line of the recogniser."""
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -85,6 +86,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except PnvError as error:
         print(f"pnv: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # who read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tries once more at its end
+        return 0
     except OSError as error:  # a path that cannot be read or written: the system's words name it
         print(one_line(f"pnv: {error.strerror or error}: {error.filename or ''}"), file=sys.stderr)
         return 2

@@ -56,7 +56,7 @@ class Tally:
         if not self.queries:
             return (
                 f"{self.frames} frames span {self.span_s:.0f} s; a match must be at least "
-                f"{config.exclude_recent_s:g} s older (--exclude-recent-s)"
+                f"{config.exclude_recent_s:g} s older (--exclude-recent-s; images in a folder: --fps, --timestamps)"
             )
         assert self.best is not None
         return (

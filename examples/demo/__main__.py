@@ -120,7 +120,8 @@ def report(args: argparse.Namespace, run: Run) -> int:
     if not run.heard.closures:
         span = run.span_s
         print(
-            f"nothing found: the input spans {span:.0f} s, and a match is at least {args.exclude_recent_s:g} s older",
+            f"nothing found: the input spans {span:.0f} s, and a match is at least {args.exclude_recent_s:g} s older "
+            '(a folder of images taken once a second: make demo IMAGES=DIR ARGS="--fps 1")',
             file=sys.stderr,
         )
         return 1

@@ -4,6 +4,8 @@ import csv
 import json
 import shutil
 import struct
+import subprocess
+import sys
 
 import cv2
 import numpy as np
@@ -313,3 +315,13 @@ def test_weights_verify_takes_the_names_that_weights_list_prints(capsys, monkeyp
     assert main(["weights", "verify", "default"]) == 0
     assert "default.safetensors: " in capsys.readouterr().out
     assert "pnv weights fetch mapillary_WPCA128" in refused(capsys, "weights", "verify", "mapillary_WPCA128")
+
+
+def test_a_reader_that_has_seen_enough_is_told_nothing():
+    """`pnv doctor | head -1`."""
+    command = [sys.executable, "-c", "import sys; from pnv_cli.main import main; sys.exit(main(['doctor']))"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        child.stdout.close()
+        said = child.stderr.read()
+        assert child.wait(300) == 0
+    assert said == b""
