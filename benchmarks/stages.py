@@ -91,9 +91,7 @@ def main() -> None:
         recognizer.keyframes.forget()
         return recognizer.look(message_to_frame(raw[number % len(raw)], "0"))
 
-    together = flowing(
-        recognizer, look, args.frames
-    )  # first: after the stages by themselves it takes half as long again
+    together = flowing(recognizer, look, args.frames)  # first: after the stages by themselves it takes longer
     found = means(
         {
             "decode raw": lambda i: message_to_frame(raw[i % len(raw)], "0"),

@@ -52,8 +52,8 @@ class Compiled:
     ) -> None:
         """`graph` makes it; where its types are wider it computes in `precision`. `threads` 0 = all cores.
 
-        `kept` is a file for what was compiled: its name must tell apart whatever shapes the graph. With other settings,
-        another release of the library or damage it is made again.
+        `kept` is a file for what was compiled: its name must tell apart whatever shapes the graph; precision and
+        threads are added to it. With another release of the library or damage it is made again.
         """
         settings: dict[str, Any] = {
             "PERFORMANCE_HINT": "LATENCY",
@@ -62,6 +62,7 @@ class Compiled:
             "ENABLE_CPU_PINNING": False,  # the camera's driver and the middleware want these cores as well
         }
         stamp = f"{ov.__version__} {settings}".encode()
+        kept = kept and kept.with_name(f"{kept.name}_{precision}_{threads}")
         file, found = _kept(kept, stamp, settings) if kept is not None else (None, None)
         if found is None:
             found = ov.Core().compile_model(graph(), "CPU", settings)

@@ -42,7 +42,7 @@ class LighterGlue:
 
     def __init__(self, threads: int = 0, precision: str = "float32", folder: Path | None = None) -> None:
         """Threads and precision as in Config; `folder` is for what is compiled."""
-        kept = None if folder is None else folder / f"lighterglue_{_GRAPH}_{MOST}_{precision}_{threads}"
+        kept = None if folder is None else folder / f"lighterglue_{_GRAPH}_{MOST}"
         self._compile = cache(lambda: Compiled(_graph, threads, precision, kept))
 
     def matches(

@@ -113,11 +113,7 @@ class XFeat:
         return LocalFeatures(points.astype(np.float32), found)
 
     def _compile(self, rows: int, cols: int) -> Compiled:
-        kept = (
-            None
-            if self._cache is None
-            else self._cache / f"xfeat_{_GRAPH}_{rows}x{cols}_{self._settings[1]}_{self._settings[0]}"
-        )
+        kept = None if self._cache is None else self._cache / f"xfeat_{_GRAPH}_{rows}x{cols}"
         return Compiled(lambda: _graph(rows, cols), *self._settings, kept)
 
     def _sized(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:

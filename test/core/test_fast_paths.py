@@ -279,14 +279,16 @@ def test_bfloat16_layers_compute_what_torch_does_with_weights_and_maps_rounded()
     assert abs((found - expected.numpy()).mean()) < 2**-11 * expected.abs().max()
 
 
-def test_each_precision_finds_what_it_compiled(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    "settings", [[{"trunk_precision": "float32"}, {"trunk_precision": "bfloat16"}], [{"threads": 1}, {"threads": 2}]]
+)
+def test_each_precision_and_number_of_threads_finds_what_it_compiled(tmp_path, monkeypatch, settings):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     image = np.random.default_rng(8).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
-    precisions = ("float32", "bfloat16")
-    made = [load_describer(trunk_precision=p).describe(image).global_vector for p in precisions]
+    made = [load_describer(verify=0, **own).describe(image).global_vector for own in settings]
     kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "pnv_ros" / "openvino").iterdir()}
     assert len(kept) == 2
-    found = [load_describer(trunk_precision=p).describe(image).global_vector for p in precisions]
+    found = [load_describer(verify=0, **own).describe(image).global_vector for own in settings]
     assert all(np.array_equal(a, b) for a, b in zip(made, found, strict=True))
     assert {file: file.stat().st_mtime_ns for file in kept} == kept
 
