@@ -1,6 +1,7 @@
 """A robot in a saved map: its pose, or that it is lost."""
 
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -82,8 +83,12 @@ def test_a_robot_in_a_map_is_localised_says_so_on_request_and_says_when_it_is_lo
         answer = trigger(listener, "relocalize")
         assert (answer.success, answer.message[:5]) == (False, "lost:")
         truth = robot.pose(4.2, 0.15, 0.1)
-        robot.sees(1000, truth)
-        fix = wait_until(lambda: poses, 60, "a fix")[0]
+        for _ in range(6):
+            robot.sees(1000, truth)  # again where it was dropped; one that was taken is not taken twice
+            with suppress(AssertionError):
+                wait_until(lambda: poses, 10, "a fix")
+                break
+        fix = wait_until(lambda: poses, 10, "a fix")[0]
         assert (fix.header.frame_id, fix.header.stamp.sec) == ("map", EPOCH_S + 1000)
         away = np.linalg.inv(truth.matrix()) @ matrix_of_pose(fix.pose.pose)
         assert np.linalg.norm(away[:3, 3]) < 0.05  # metres
